@@ -1,0 +1,144 @@
+"""The rasterizer seam: protocol, chooser and the compositing constants that every backend shares.
+
+The constants are those of gsplat 1.4.0's CUDA kernels, so that a scene trained with one backend looks the same with another.
+"""
+
+import importlib
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import Literal, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from freqgs_plugin.types import Camera, Rendering, Splats
+
+ALPHA_MAX = 0.999
+"""cap of one Gaussian's opacity at a pixel (`rasterize_to_pixels_fwd.cu`)"""
+ALPHA_MIN = 1.0 / 255.0
+"""contributions below this are skipped"""
+TRANSMITTANCE_MIN = 1e-4
+"""a pixel is finished before the Gaussian that would bring its transmittance to this or less"""
+NEAR_PLANE = 0.01
+"""camera z at or below this is culled, world units"""
+FOV_MARGIN = 0.15
+"""the projection's Jacobian is taken at most this share of the image size outside of the image"""
+BLUR = 0.3
+"""variance added to the projected covariance, px^2"""
+RADIUS_SIGMAS = 3.0
+"""`info["radii"]` is this many standard deviations of the longer axis, rounded up, px"""
+
+Statistics = Literal["own", "full"]
+"""which prefix feeds `info["means2d"].grad` and `.absgrad` of a prefix rendering:
+`own`: for a Gaussian of level k the rendering of prefix k; `full`: the rendering of all levels for everyone"""
+
+
+@runtime_checkable
+class Rasterizer(Protocol):
+    """Composites splats front to back for one camera.
+
+    All backends share this module's constants, order equal depths by row, and never clamp.
+    """
+
+    name: str
+    absgrad: bool
+    """`info["means2d"].absgrad` exists after backward"""
+
+    def __call__(
+        self,
+        splats: Splats,
+        camera: Camera,
+        *,
+        background: Float[Tensor, " d"] | None = None,
+        blur: float = BLUR,
+        antialiased: bool = False,
+        depth: bool = True,
+    ) -> Rendering:
+        """Render `splats`, in the dtype and on the device of its tensors.
+
+        Args:
+            splats: n Gaussians with d features each.
+            camera: the view.
+            background: feature of what lies behind everything; zeros where None.
+            blur: variance added to the projected covariance, px^2.
+            antialiased: scale opacities by sqrt(det(cov) / det(cov + blur)) (Mip-Splatting's 2D filter).
+            depth: also composite the expected depth; `Rendering.depth` is zero where this is False.
+
+        Returns:
+            features [h, w, d], alpha and expected depth [h, w, 1], and `info` with gsplat's keys: `means2d` [1, n, 2] px
+            (after backward with `.grad`, and `.absgrad` where the backend has `absgrad`), `radii` [1, n] px (0: not
+            drawn), `depths`, `conics`, `opacities` [1, n], `width`, `height`, `n_cameras`, `gaussian_ids`, `camera_ids`.
+        """
+        ...
+
+
+@runtime_checkable
+class PrefixRasterizer(Rasterizer, Protocol):
+    """A rasterizer that composites all level prefixes in a single pass."""
+
+    def prefixes(
+        self,
+        splats: Splats,
+        level: Int[Tensor, " n"],
+        num_levels: int,
+        camera: Camera,
+        *,
+        background: Float[Tensor, " d"] | None = None,
+        blur: float = BLUR,
+        antialiased: bool = False,
+        statistics: Statistics = "full",
+    ) -> list[Rendering]:
+        """One rendering per prefix k = 1..num_levels of all splats with `level <= k`, without depth.
+
+        The last rendering's `info` describes all n splats; its `means2d` receives the gradients that `statistics` names.
+        """
+        ...
+
+
+Factory = Callable[[bool], Rasterizer]
+"""makes a rasterizer; the argument asks for `absgrad`"""
+
+ENTRY_POINT_GROUP = "freqgs_plugin.rasterizers"
+_BUILT_IN = {
+    "torch": ("freqgs_plugin.rendering.torch_backend", "TorchRasterizer"),
+    "numba": ("freqgs_plugin.rendering.numba_backend", "NumbaRasterizer"),
+    "gsplat": ("freqgs_plugin.rendering.gsplat_backend", "GsplatRasterizer"),
+}
+
+
+def available_rasterizers() -> list[str]:
+    """Names that `get_rasterizer` knows: built in and registered by entry point."""
+    return [*_BUILT_IN, *(e.name for e in entry_points(group=ENTRY_POINT_GROUP) if e.name not in _BUILT_IN)]
+
+
+def get_rasterizer(name: str, device: torch.device | str, *, absgrad: bool = True) -> Rasterizer:
+    """The rasterizer called `name`; `auto` takes gsplat on CUDA, numba on the CPU and torch elsewhere.
+
+    Third parties add theirs by an entry point in the group `freqgs_plugin.rasterizers` that names a callable
+    `(absgrad: bool) -> Rasterizer`.
+
+    Raises:
+        ValueError: no such rasterizer, or it cannot run on `device`; the message names those that can.
+    """
+    kind = torch.device(device).type
+    if name == "auto":
+        name = {"cuda": "gsplat", "cpu": "numba"}.get(kind, "torch")
+    fitting = ["torch", *(["numba"] if kind == "cpu" else []), *(["gsplat"] if kind == "cuda" else [])]
+    if name == "gsplat" and kind != "cuda":
+        raise ValueError(
+            f"rasterizer 'gsplat' needs a CUDA device, but the tensors are on '{kind}'. "
+            f"On this device choose one of: auto, {', '.join(fitting)}."
+        )
+    if name == "numba" and kind != "cpu":
+        raise ValueError(
+            f"rasterizer 'numba' runs on the CPU only, but the tensors are on '{kind}'. Choose: auto, {', '.join(fitting)}."
+        )
+    if name in _BUILT_IN:
+        module, attribute = _BUILT_IN[name]
+        return getattr(importlib.import_module(module), attribute)(absgrad=absgrad)
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        if entry.name == name:
+            factory: Factory = entry.load()
+            return factory(absgrad)
+    raise ValueError(f"unknown rasterizer '{name}'. Choose one of: auto, {', '.join(available_rasterizers())}.")
