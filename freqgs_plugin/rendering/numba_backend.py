@@ -1,0 +1,279 @@
+"""The fast rasterizer for a CPU: float32, compiled by numba, all level prefixes in a single pass.
+
+Agrees with the torch reference to float32 rounding (docs/backends.md has the figures). The same input gives the same
+bits, with any number of threads: no two threads ever add to the same number.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from numba import get_num_threads
+from rich.console import Console
+from torch import Tensor
+
+from freqgs_plugin.rendering.base import BLUR, Statistics
+from freqgs_plugin.rendering.numba_binning import depth_order, tile_lists
+from freqgs_plugin.rendering.numba_compositing import composite, composite_backward
+from freqgs_plugin.rendering.numba_projection import COLUMNS, OPACITY, V_COLUMNS, project, project_backward
+from freqgs_plugin.rendering.numba_threads import check_layer, choose_layer
+from freqgs_plugin.types import Camera, Rendering, Splats
+
+_CHANNELS = 3
+"""features composited per pass"""
+
+
+@dataclass
+class _View:
+    """What forward leaves for backward: arrays that share memory with torch tensors."""
+
+    pose: Any
+    intrinsics: tuple[float, float, float, float]
+    width: int
+    height: int
+    blur: float
+    antialiased: bool
+    prefixes: int
+    own: bool
+    level: Any
+    splats: Any
+    lists: Any
+
+
+def _array(tensor: Tensor) -> Any:
+    return tensor.detach().contiguous().numpy()
+
+
+def _check(splats: Splats, camera: Camera) -> None:
+    for name in ("means", "quats", "scales", "opacities", "features"):
+        tensor: Tensor = getattr(splats, name)
+        if tensor.device.type != "cpu" or tensor.dtype != torch.float32:
+            raise TypeError(
+                f"the numba rasterizer takes float32 tensors on the CPU, but {name} is {tensor.dtype} on "
+                f"{tensor.device}. Convert it, or use the torch rasterizer."
+            )
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(f"camera is {camera.width}x{camera.height} px; both sides must be at least 1.")
+
+
+def _feature_groups(features: Tensor) -> list[Any]:
+    """Features [n, d] as arrays [n, 3], the last one padded with zeros."""
+    d = features.shape[1]
+    groups = []
+    for start in range(0, d, _CHANNELS):
+        group = features.detach()[:, start : start + _CHANNELS]
+        missing = _CHANNELS - group.shape[1]
+        groups.append(_array(torch.nn.functional.pad(group, (0, missing)) if missing else group))
+    return groups
+
+
+class _Composite(torch.autograd.Function):
+    """(splats, means2d probe, view matrix) -> features [prefixes, h, w, d], light [prefixes, h, w], depth [h, w]."""
+
+    @staticmethod
+    def forward(ctx, means, quats, scales, opacities, features, means2d, viewmat, view: _View, depths, with_depth, probe):
+        shape = (view.prefixes, view.height, view.width)
+        light, depth = torch.empty(shape), torch.zeros(shape[1:])
+        images = []
+        for number, group in enumerate(_feature_groups(features)):
+            image = torch.empty(*shape, _CHANNELS)
+            composite(
+                *view.lists[:3], view.splats, _array(depths), view.level, view.prefixes, group,
+                with_depth and number == 0, view.width, view.height, image.numpy(), light.numpy(), depth.numpy(),
+            )  # fmt: skip
+            images.append(image)
+        ctx.save_for_backward(means, quats, scales, opacities, features, light, *images)
+        ctx.view, ctx.probe = view, probe
+        ctx.mark_non_differentiable(depth)
+        return torch.cat(images, -1)[..., : features.shape[1]] if len(images) > 1 else images[0][
+            ..., : features.shape[1]
+        ], light, depth  # fmt: skip
+
+    @staticmethod
+    def backward(ctx, v_features, v_light, _v_depth):
+        means, quats, scales, opacities, features, light, *images = ctx.saved_tensors
+        view: _View = ctx.view
+        offsets, ids, boxes, slots, first, count = view.lists
+        n, d = features.shape
+        partial = torch.empty(len(ids), V_COLUMNS)
+        total = {
+            name: torch.zeros(n, width)
+            for name, width in (("means", 3), ("quats", 4), ("scales", 3), ("opacity", 1), ("xy", 2), ("abs", 2))
+        }
+        v_view = torch.zeros(n if ctx.needs_input_grad[6] else 0, 12)
+        v_feature_groups = []
+        for number, group in enumerate(_feature_groups(features)):
+            v_image = v_features[..., number * _CHANNELS : (number + 1) * _CHANNELS]
+            v_image = torch.nn.functional.pad(v_image, (0, _CHANNELS - v_image.shape[-1]))
+            composite_backward(
+                offsets, ids, boxes, slots, view.splats, view.level, view.prefixes, view.own, group,
+                view.width, view.height, images[number].numpy(), light.numpy(), _array(v_image),
+                _array(v_light if number == 0 else torch.zeros_like(v_light)), partial.numpy(),
+            )  # fmt: skip
+            out = {name: torch.zeros_like(tensor) for name, tensor in total.items()}
+            v_group = torch.zeros(n, _CHANNELS)
+            v_view_group = torch.zeros_like(v_view)
+            project_backward(
+                _array(means), _array(quats), _array(scales), _array(opacities), view.pose, view.intrinsics,
+                view.width, view.height, view.blur, view.antialiased, first, count, partial.numpy(),
+                out["means"].numpy(), out["quats"].numpy(), out["scales"].numpy(), out["opacity"].numpy()[:, 0],
+                v_group.numpy(), out["xy"].numpy(), out["abs"].numpy(), v_view_group.numpy(),
+            )  # fmt: skip
+            v_feature_groups.append(v_group)
+            for name in total:
+                total[name] += out[name]
+            v_view += v_view_group
+        if ctx.probe is not None:
+            ctx.probe.absgrad = total["abs"][None]
+        v_pose = None
+        if ctx.needs_input_grad[6]:
+            rows = v_view.double().sum(0).float()
+            v_pose = torch.cat([torch.cat([rows[:9].view(3, 3), rows[9:, None]], 1), torch.zeros(1, 4)])
+        v_all = torch.cat(v_feature_groups, 1)[:, :d]
+        return (
+            total["means"], total["quats"], total["scales"], total["opacity"][:, 0], v_all, total["xy"][None], v_pose,
+            None, None, None, None,
+        )  # fmt: skip
+
+
+class NumbaRasterizer:
+    """Renders float32 tensors on the CPU. Gradients: all of `Splats`, and the camera's view matrix."""
+
+    name = "numba"
+
+    def __init__(self, absgrad: bool = True):
+        self.absgrad = absgrad
+        warm_up()
+
+    def __call__(
+        self,
+        splats: Splats,
+        camera: Camera,
+        *,
+        background: Float[Tensor, " d"] | None = None,
+        blur: float = BLUR,
+        antialiased: bool = False,
+        depth: bool = True,
+    ) -> Rendering:
+        """See `Rasterizer.__call__`."""
+        level = torch.ones(len(splats), dtype=torch.int32)
+        return self._render(splats, level, 1, camera, background, blur, antialiased, False, depth)[0]
+
+    def prefixes(
+        self,
+        splats: Splats,
+        level: Int[Tensor, " n"],
+        num_levels: int,
+        camera: Camera,
+        *,
+        background: Float[Tensor, " d"] | None = None,
+        blur: float = BLUR,
+        antialiased: bool = False,
+        statistics: Statistics = "full",
+    ) -> list[Rendering]:
+        """See `PrefixRasterizer.prefixes`."""
+        if len(level) and not 1 <= int(level.min()) <= int(level.max()) <= num_levels:
+            raise ValueError(
+                f"levels run from {int(level.min())} to {int(level.max())}, outside of 1..{num_levels}; "
+                "pass the number of levels of the model."
+            )
+        own = statistics == "own"
+        return self._render(splats, level.int(), num_levels, camera, background, blur, antialiased, own, False)
+
+    def _render(
+        self, splats: Splats, level: Tensor, prefixes: int, camera: Camera, background: Tensor | None,
+        blur: float, antialiased: bool, own: bool, depth: bool,
+    ) -> list[Rendering]:  # fmt: skip
+        _check(splats, camera)
+        n = len(splats)
+        projected, conics, depths = torch.zeros(n, COLUMNS), torch.zeros(n, 3), torch.zeros(n)
+        radii = torch.zeros(n, dtype=torch.int32)
+        pose = camera.viewmat.detach().double().contiguous().numpy()
+        K = camera.K
+        intrinsics = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        geometry = tuple(_array(t) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
+        project(
+            *geometry, pose, intrinsics, camera.width, camera.height, blur, antialiased,
+            projected.numpy(), conics.numpy(), depths.numpy(), radii.numpy(),
+        )  # fmt: skip
+        order = depth_order(depths.numpy(), projected.numpy())
+        lists = tile_lists(order, projected.numpy(), camera.width, camera.height, n, get_num_threads())
+        view = _View(
+            pose, intrinsics, camera.width, camera.height, blur, antialiased, prefixes, own,
+            _array(level), projected.numpy(), lists,
+        )  # fmt: skip
+        means2d = projected[None, :, :2].clone()
+        wants_grad = torch.is_grad_enabled() and any(
+            t.requires_grad for t in (splats.means, splats.quats, splats.scales, splats.opacities, splats.features)
+        )
+        means2d.requires_grad_(wants_grad)
+        features, light, z = _Composite.apply(
+            splats.means, splats.quats, splats.scales, splats.opacities, splats.features, means2d, camera.viewmat,
+            view, depths, depth, means2d if wants_grad and self.absgrad else None,
+        )  # fmt: skip
+        if background is not None:
+            features = features + light[..., None] * background
+        alpha = 1 - light[..., None]
+        expected = torch.where(alpha[0] > 0, z[..., None] / alpha[0].clamp_min(1e-10), 0.0).detach()
+        info = {
+            "camera_ids": None,
+            "gaussian_ids": None,
+            "radii": radii[None],
+            "means2d": means2d,
+            "depths": depths[None],
+            "conics": conics[None],
+            "opacities": projected[None, :, OPACITY],
+            "width": camera.width,
+            "height": camera.height,
+            "n_cameras": 1,
+            "tile_size": 16,
+        }
+        return [
+            Rendering(features[k], alpha[k], expected, info if k == prefixes - 1 else {}) for k in range(prefixes)
+        ]
+
+
+_warm = False
+
+
+def warm_up() -> None:
+    """Compile the kernels or load them from numba's cache, once per process; says so where it compiles."""
+    global _warm
+    if _warm:
+        return
+    _warm = True
+    cache = Path(composite_backward._cache.cache_path)  # pyright: ignore[reportFunctionMemberAccess]
+    cached = any(cache.glob("numba_compositing.composite_backward*.nbc"))
+    console = Console(stderr=True)
+    if not cached:
+        console.print("Compiling the CPU rasterizer (once, about 20 seconds; later starts load it from a cache) ...")
+    choose_layer()
+    try:
+        _render_speck()
+    except ValueError as error:
+        raise RuntimeError(
+            "numba found no thread-safe threading layer, which two threads that render (training and viewer) need. "
+            "Install it with `pip install tbb`, or use --pipeline.model.rasterizer torch."
+        ) from error
+    layer = check_layer()
+    if not cached:
+        console.print(f"... compiled. {get_num_threads()} threads, threading layer '{layer}'.")
+
+
+def _render_speck() -> None:
+    """One Gaussian in one pixel, forward and backward, in every variant that is compiled separately."""
+    rasterizer = object.__new__(NumbaRasterizer)
+    rasterizer.absgrad = True
+    leaves = [
+        torch.tensor([[0.0, 0.0, 1.0]]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        torch.ones(1, 3),
+        torch.full((1,), 0.5),
+        torch.ones(1, 3),
+    ]
+    splats = Splats(*(leaf.requires_grad_() for leaf in leaves))
+    camera = Camera(torch.eye(4), torch.eye(3), 1, 1)
+    rasterizer(splats, camera).features.sum().backward()
+    rasterizer.prefixes(splats, torch.ones(1, dtype=torch.int32), 2, camera)

@@ -1,0 +1,168 @@
+"""Compiled depth order and tile lists.
+
+Each tile of TILE x TILE pixels gets the Gaussians whose ellipse {alpha >= ALPHA_MIN} meets its pixel centres, front to
+back, equal depths by row. Each entry carries a box: which rows and which 8-pixel strips of the tile the ellipse meets.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from freqgs_plugin.rendering.base import ALPHA_MIN
+from freqgs_plugin.rendering.numba_projection import HALF_A, HALF_C, OPACITY, REACH_X, REACH_Y, B, X, Y
+
+TILE = 16
+STRIP = 8
+_RADIX_BITS = 11
+_SLACK = 1e-3
+"""px by which spans are widened, so that rounding never drops a pixel at ALPHA_MIN"""
+
+
+@njit(cache=True)
+def depth_order(depths, splats):
+    """Rows of drawn Gaussians (opacity > 0) by increasing depth, equal depths by row: a stable radix sort."""
+    n = 0
+    rows = np.empty(depths.shape[0], np.int32)
+    for i in range(depths.shape[0]):
+        if splats[i, OPACITY] > 0:
+            rows[n] = i
+            n += 1
+    rows = rows[:n]
+    bits = depths.view(np.uint32)
+    swap = np.empty(n, np.int32)
+    buckets = 1 << _RADIX_BITS
+    for shift in range(0, 32, _RADIX_BITS):
+        start = np.zeros(buckets + 1, np.int64)
+        for i in rows:
+            start[((bits[i] >> np.uint32(shift)) & np.uint32(buckets - 1)) + 1] += 1
+        for k in range(buckets):
+            start[k + 1] += start[k]
+        for i in rows:
+            k = (bits[i] >> np.uint32(shift)) & np.uint32(buckets - 1)
+            swap[start[k]] = i
+            start[k] += 1
+        rows, swap = swap, rows
+    return rows
+
+
+@njit(error_model="numpy", inline="always")
+def _x_span(a, b, c, sheared, rx, ry, low, high):
+    """Least and greatest dx on the ellipse between rows dy = low and high (both within or nearest to it).
+
+    At offset dy the ellipse is `sheared` * sqrt(1 - (dy / ry)^2) px to either side of the line dx = -b / a dy.
+    """
+    low, high = min(max(low, -ry), ry), min(max(high, -ry), ry)
+    slope = b / a
+    low_half = sheared * math.sqrt(max(0.0, 1.0 - (low / ry) * (low / ry)))
+    high_half = sheared * math.sqrt(max(0.0, 1.0 - (high / ry) * (high / ry)))
+    greatest = max(-slope * low + low_half, -slope * high + high_half)
+    least = min(-slope * low - low_half, -slope * high - high_half)
+    extreme = -b / c * rx  # dy at which dx is greatest
+    if low <= extreme <= high:
+        greatest = rx
+    if low <= -extreme <= high:
+        least = -rx
+    return least, greatest
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def tile_lists(order, splats, width, height, num_rows, bands):
+    """Tile lists of the Gaussians in `order`, made in `bands` parallel parts.
+
+    Returns:
+        offsets [tiles + 1] into the lists; ids [entries] Gaussian rows; boxes [entries]: first row, last row, first and
+        last strip within the tile, 4 + 4 + 4 + 4 bits; slots [entries] where a Gaussian's entries are contiguous; first
+        and count [num_rows] of each Gaussian's slots.
+    """
+    tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    n = order.shape[0]
+    row_first = np.zeros(n, np.int32)
+    row_start = np.zeros(n + 1, np.int64)
+    for k in range(n):
+        i = order[k]
+        low = max(math.ceil(splats[i, Y] - splats[i, REACH_Y] - 0.5 - _SLACK), 0.0)
+        high = min(math.floor(splats[i, Y] + splats[i, REACH_Y] - 0.5 + _SLACK), height - 1.0)
+        rows = 0
+        if low <= high:
+            row_first[k] = int(low) // TILE
+            rows = int(high) // TILE - row_first[k] + 1
+        row_start[k + 1] = row_start[k] + rows
+
+    # columns of pixels per Gaussian and row of tiles
+    spans = np.empty((row_start[n], 2), np.int32)
+    entries = np.zeros(n + 1, np.int64)
+    for k in prange(n):
+        i = order[k]
+        x, y = np.float64(splats[i, X]), np.float64(splats[i, Y])
+        a, b, c = 2.0 * splats[i, HALF_A], np.float64(splats[i, B]), 2.0 * splats[i, HALF_C]
+        rx, ry = np.float64(splats[i, REACH_X]) + 1e-30, np.float64(splats[i, REACH_Y]) + 1e-30
+        sheared = math.sqrt(2.0 * math.log(splats[i, OPACITY] / ALPHA_MIN) / a)
+        total = 0
+        for r in range(row_start[k], row_start[k + 1]):
+            top = (row_first[k] + r - row_start[k]) * TILE + 0.5 - y
+            least, greatest = _x_span(a, b, c, sheared, rx, ry, top, top + TILE - 1.0)
+            low = max(math.ceil(x + least - 0.5 - _SLACK), 0.0)
+            high = min(math.floor(x + greatest - 0.5 + _SLACK), width - 1.0)
+            spans[r, 0], spans[r, 1] = 0, -1
+            if low <= high:
+                spans[r, 0], spans[r, 1] = int(low), int(high)
+                total += int(high) // TILE - int(low) // TILE + 1
+        entries[k + 1] = total
+    for k in range(n):
+        entries[k + 1] += entries[k]
+
+    first, count = np.zeros(num_rows, np.int64), np.zeros(num_rows, np.int32)
+    for k in range(n):
+        first[order[k]] = entries[k]
+        count[order[k]] = entries[k + 1] - entries[k]
+
+    # threads take bands of tile rows: each list is filled by one thread, in depth order
+    bands = min(bands, tiles_y)
+    offsets = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    for band in prange(bands):
+        low, high = band * tiles_y // bands, (band + 1) * tiles_y // bands
+        for k in range(n):
+            begin = row_first[k]
+            for ty in range(max(begin, low), min(begin + row_start[k + 1] - row_start[k], high)):
+                r = row_start[k] + ty - begin
+                if spans[r, 0] <= spans[r, 1]:
+                    for tx in range(spans[r, 0] // TILE, spans[r, 1] // TILE + 1):
+                        offsets[ty * tiles_x + tx + 1] += 1
+    for t in range(tiles_x * tiles_y):
+        offsets[t + 1] += offsets[t]
+
+    cursor = offsets[:-1].copy()
+    ids = np.empty(entries[n], np.int32)
+    slots = np.empty(entries[n], np.int64)
+    boxes = np.empty(entries[n], np.uint16)
+    for band in prange(bands):
+        low, high = band * tiles_y // bands, (band + 1) * tiles_y // bands
+        for k in range(n):
+            i = order[k]
+            begin = row_first[k]
+            end = begin + row_start[k + 1] - row_start[k]
+            if end <= low or begin >= high:
+                continue
+            slot = entries[k]
+            bottom = math.ceil(splats[i, Y] - splats[i, REACH_Y] - 0.5 - _SLACK)
+            top = math.floor(splats[i, Y] + splats[i, REACH_Y] - 0.5 + _SLACK)
+            for ty in range(begin, end):
+                r = row_start[k] + ty - begin
+                if spans[r, 0] > spans[r, 1]:
+                    continue
+                if ty < low or ty >= high:
+                    slot += spans[r, 1] // TILE - spans[r, 0] // TILE + 1
+                    continue
+                row_low = int(max(bottom - ty * TILE, 0.0))
+                row_high = int(min(top - ty * TILE, TILE - 1.0))
+                for tx in range(spans[r, 0] // TILE, spans[r, 1] // TILE + 1):
+                    strip_low = max(spans[r, 0] - tx * TILE, 0) // STRIP
+                    strip_high = min(spans[r, 1] - tx * TILE, TILE - 1) // STRIP
+                    t = ty * tiles_x + tx
+                    ids[cursor[t]] = i
+                    slots[cursor[t]] = slot
+                    boxes[cursor[t]] = row_low | row_high << 4 | strip_low << 8 | strip_high << 12
+                    cursor[t] += 1
+                    slot += 1
+    return offsets, ids, boxes, slots, first, count

@@ -1,0 +1,50 @@
+"""Which threads numba runs on. Import this before any kernel is compiled.
+
+Viewer and training are two threads that render at the same time. numba's `workqueue` layer aborts the process then, and
+`omp` (GNU OpenMP) kills a child that is forked after first use; `tbb` allows both. The `tbb` wheel puts its library where
+the dynamic linker does not look, so numba alone would not find it: it is loaded by path here.
+"""
+
+import ctypes
+import os
+from importlib.metadata import PackageNotFoundError, files
+
+import numba
+
+_LIBRARIES = ("libtbb.so.12", "libtbb.12.dylib", "tbb12.dll")
+
+
+def _load_tbb() -> bool:
+    """Load the library of the installed `tbb` distribution; False where there is none for this machine."""
+    try:
+        candidates = [f for f in files("tbb") or [] if f.name in _LIBRARIES]
+    except PackageNotFoundError:
+        return False
+    for candidate in candidates:
+        try:
+            ctypes.CDLL(str(candidate.locate().resolve()), mode=ctypes.RTLD_GLOBAL)  # pyright: ignore
+        except OSError:
+            continue
+        return True
+    return False
+
+
+def choose_layer() -> None:
+    """Ask numba for a thread-safe layer, tbb where it is installed. NUMBA_THREADING_LAYER wins."""
+    if "NUMBA_THREADING_LAYER" not in os.environ:
+        numba.config.THREADING_LAYER = "tbb" if _load_tbb() else "threadsafe"  # pyright: ignore
+
+
+def check_layer() -> str:
+    """Name of the layer in use, after the first parallel kernel ran.
+
+    Raises:
+        RuntimeError: it is the one that aborts when two threads render.
+    """
+    layer = numba.threading_layer()
+    if layer == "workqueue":
+        raise RuntimeError(
+            "numba runs on its 'workqueue' threading layer, which aborts the process when two threads render at once. "
+            "Install tbb (`pip install tbb`) and unset NUMBA_THREADING_LAYER, or use the torch rasterizer."
+        )
+    return layer
