@@ -1,0 +1,84 @@
+"""Real spherical harmonics up to degree 4, in the sign convention of 3D Gaussian splatting, and colours from them."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+MAX_DEGREE = 4
+C0 = 0.28209479177387814
+"""the constant basis function, sqrt(1 / 4 pi)"""
+
+
+def num_coefficients(degree: int) -> int:
+    """Coefficients per channel of harmonics up to `degree`."""
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"SH degree {degree} is outside of 0..{MAX_DEGREE}.")
+    return (degree + 1) ** 2
+
+
+def basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
+    """Basis functions at unit `directions` (camera to Gaussian, world axes), k = (degree + 1)^2."""
+    num_coefficients(degree)
+    x, y, z = directions.unbind(-1)
+    out = [torch.full_like(x, C0)]
+    if degree > 0:
+        out += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if degree > 1:
+        xx, yy, zz = x * x, y * y, z * z
+        out += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if degree > 2:
+        out += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    if degree > 3:
+        out += [
+            2.5033429417967046 * x * y * (xx - yy),
+            -1.7701307697799304 * y * z * (3 * xx - yy),
+            0.9461746957575601 * x * y * (7 * zz - 1),
+            -0.6690465435572892 * y * z * (7 * zz - 3),
+            0.10578554691520431 * (zz * (35 * zz - 30) + 3),
+            -0.6690465435572892 * x * z * (7 * zz - 3),
+            0.47308734787878004 * (xx - yy) * (7 * zz - 1),
+            -1.7701307697799304 * x * z * (xx - 3 * yy),
+            0.6258357354491761 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
+        ]
+    return torch.stack(out, -1)
+
+
+def evaluate(sh: Float[Tensor, "n k 3"], offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Harmonics with coefficients `sh` in the direction of `offsets` (any length; at length 0 the direction is 0)."""
+    degree = round(sh.shape[1] ** 0.5) - 1
+    if degree == 0:
+        return C0 * sh[:, 0]
+    directions = torch.nn.functional.normalize(offsets, dim=-1)
+    return (basis(directions, degree)[:, :, None] * sh).sum(1)
+
+
+def level_colours(
+    sh: Float[Tensor, "n k 3"],
+    offsets: Float[Tensor, "n 3"],
+    level: Int[Tensor, " n"],
+    signed_residuals: bool,
+) -> Float[Tensor, "n 3"]:
+    """Colours of the Laplacian-pyramid paper: clamp_min(SH + 0.5, 0) (Eq. 3); above level 1 twice that minus 1 (Eq. 4).
+
+    With `signed_residuals` False, Eq. 3 for every level. Eq. 4's range is [-1, inf): the paper names [-1, 1], its code
+    does not clamp from above.
+    """
+    colour = torch.clamp_min(evaluate(sh, offsets) + 0.5, 0.0)
+    if not signed_residuals:
+        return colour
+    residual = (level > 1)[:, None].to(colour.dtype)
+    return colour * (1 + residual) - residual

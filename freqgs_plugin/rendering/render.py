@@ -1,0 +1,104 @@
+"""From Gaussians, a camera and an attenuation to a picture: the only path there is."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from freqgs_plugin.functional.attenuation import Attenuation
+from freqgs_plugin.functional.harmonics import level_colours
+from freqgs_plugin.rendering.base import PrefixRasterizer, Rasterizer, Statistics
+from freqgs_plugin.types import Camera, Gaussians, Rendering, Splats
+
+
+def shade(gaussians: Gaussians, camera: Camera, weight: Float[Tensor, " n"] | None = None) -> Splats:
+    """Splats of one view: colours in the viewing direction, opacities times `weight`."""
+    return Splats(
+        means=gaussians.means,
+        quats=gaussians.quats,
+        scales=gaussians.scales,
+        opacities=gaussians.opacities if weight is None else gaussians.opacities * weight,
+        features=level_colours(
+            gaussians.sh, gaussians.means - camera.centre, gaussians.level, gaussians.signed_residuals
+        ),
+    )
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    attenuation: Attenuation | None = None,
+    *,
+    rasterizer: Rasterizer,
+    background: Float[Tensor, " 3"] | None = None,
+    antialiased: bool = True,
+    depth: bool = True,
+) -> Rendering:
+    """The picture of `gaussians`, for viewing: rows of weight 0 are dropped before the rasterizer sees them.
+
+    `info["drawn"]` counts the rows that were passed on, and `info` otherwise describes those rows only.
+    """
+    weight = None
+    if attenuation is not None:
+        weight = attenuation(gaussians, camera)
+        keep = weight > 0
+        if not bool(keep.all()):
+            gaussians, weight = gaussians.select(keep), weight[keep]
+    splats = shade(gaussians, camera, weight)
+    rendering = rasterizer(splats, camera, background=background, antialiased=antialiased, depth=depth)
+    return Rendering(rendering.features, rendering.alpha, rendering.depth, {**rendering.info, "drawn": len(splats)})
+
+
+def render_prefixes(
+    gaussians: Gaussians,
+    camera: Camera,
+    num_levels: int,
+    *,
+    rasterizer: Rasterizer,
+    background: Float[Tensor, " 3"] | None = None,
+    antialiased: bool = True,
+    statistics: Statistics = "full",
+) -> list[Rendering]:
+    """The pictures of the prefixes 1..num_levels, for training: every row stays (Eq. 5).
+
+    The last one's `info` describes all rows; see `PrefixRasterizer.prefixes` for what its `means2d` receives.
+    """
+    splats = shade(gaussians, camera)
+    options = {"background": background, "antialiased": antialiased}
+    if num_levels == 1:
+        return [rasterizer(splats, camera, depth=False, **options)]
+    if isinstance(rasterizer, PrefixRasterizer):
+        return rasterizer.prefixes(splats, gaussians.level, num_levels, camera, statistics=statistics, **options)
+    renderings, rows_drawn = [], []
+    for k in range(1, num_levels + 1):
+        rows = torch.where(gaussians.level <= k)[0]
+        part = splats if k == num_levels else _rows(splats, rows)
+        renderings.append(rasterizer(part, camera, depth=False, **options))
+        rows_drawn.append(rows)
+    if statistics == "own" and renderings[-1].info["means2d"].requires_grad:
+        renderings[-1] = _with_own_statistics(renderings, rows_drawn, gaussians.level)
+    return renderings
+
+
+def _rows(splats: Splats, rows: Tensor) -> Splats:
+    return Splats(
+        splats.means[rows], splats.quats[rows], splats.scales[rows], splats.opacities[rows], splats.features[rows]
+    )
+
+
+def _with_own_statistics(renderings: list[Rendering], rows_drawn: list[Tensor], level: Tensor) -> Rendering:
+    """The last rendering with a `means2d` that collects, for each level, the gradients of that level's own prefix."""
+    last = renderings[-1]
+    means2d = last.info["means2d"].detach().clone().requires_grad_()
+    means2d.grad = torch.zeros_like(means2d)
+    means2d.absgrad = torch.zeros_like(means2d)
+    for k, (rendering, rows) in enumerate(zip(renderings, rows_drawn, strict=True), start=1):
+        source = rendering.info["means2d"]
+        own = level[rows] == k
+
+        def collect(grad: Tensor, source: Tensor = source, rows: Tensor = rows, own: Tensor = own) -> None:
+            means2d.grad[0, rows[own]] = grad[0, own]  # pyright: ignore[reportOptionalSubscript]
+            if hasattr(source, "absgrad"):
+                means2d.absgrad[0, rows[own]] = source.absgrad[0, own]  # pyright: ignore
+
+        source.register_hook(collect)
+    return Rendering(last.features, last.alpha, last.depth, {**last.info, "means2d": means2d})

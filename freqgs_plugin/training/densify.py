@@ -1,0 +1,131 @@
+"""Densification with level tags: gsplat's strategy and operators, told which level may grow and which are pruned.
+
+Levels are an integer tensor, not a parameter: gsplat's operators copy tensors of the strategy's state along with the rows
+that they duplicate, split or remove, so the tags travel there.
+"""
+
+from collections.abc import Mapping, MutableMapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from gsplat.strategy import DefaultStrategy
+from gsplat.strategy.ops import duplicate, remove
+from torch import Tensor
+
+from freqgs_plugin.training.schedule import Schedule
+
+Growth = Literal["all", "newest", "own_prefix"]
+Optimizers = Mapping[str, torch.optim.Optimizer]
+
+
+@dataclass
+class LevelStrategy(DefaultStrategy):
+    """gsplat's DefaultStrategy on our schedule, aware of levels."""
+
+    growth: Growth = "all"
+    """which Gaussians may grow: `all` from the full image's gradient, only those of the `newest` level, or each level
+    from the gradient of its `own_prefix`"""
+    lower_prune_opa: float = 0.005
+    """prune threshold of levels under the newest"""
+    reset_levels: Literal["all", "newest"] = "all"
+    """whose opacities are reset"""
+    max_gaussians: int = 0
+    """refinement adds none once there are this many; 0: no bound"""
+
+    def observe(self, state: dict[str, Any], info: dict[str, Any], level_weight: Tensor | None) -> None:
+        """Collect one step's 2D gradients; `level_weight` [n]: loss weights that they are freed from."""
+        grads = info["means2d"].absgrad if self.absgrad else info["means2d"].grad
+        grads = grads.clone()
+        if level_weight is not None:
+            grads /= level_weight[None, :, None]
+        seen = info["radii"][0] > 0
+        size = grads.new_tensor([info["width"], info["height"]])
+        norm = (grads[0] * size / 2.0).norm(dim=-1)
+        for key in ("grad2d", "count", "radii"):
+            if state[key] is None:
+                state[key] = torch.zeros_like(norm)
+        state["grad2d"] += torch.where(seen, norm, 0.0)
+        state["count"] += seen.to(norm.dtype)
+        screen = info["radii"][0].to(norm.dtype) / float(max(info["width"], info["height"]))
+        state["radii"] = torch.maximum(state["radii"], torch.where(seen, screen, 0.0))
+
+    def step(
+        self, params: MutableMapping[str, Any], optimizers: Optimizers, state: dict[str, Any], step: int, schedule: Schedule
+    ) -> dict[str, int]:
+        """Refine and reset as `schedule` says. Returns counts: duplicated, split, pruned, reset."""
+        done = {}
+        stage = schedule.stage(step)
+        if schedule.refines(step) and state["count"] is not None:
+            done["duplicated"], done["split"] = self._grow(params, optimizers, state, step, stage)
+            done["pruned"] = self._prune(params, optimizers, state, step, stage)
+            for key in ("grad2d", "count", "radii"):
+                state[key].zero_()
+        if schedule.resets(step):
+            done["reset"] = self._reset(params, optimizers, state, stage)
+        return done
+
+    def _grow(self, params, optimizers: Optimizers, state: dict[str, Any], step: int, stage: int) -> tuple[int, int]:
+        if self.max_gaussians and len(params["means"]) >= self.max_gaussians:
+            return 0, 0
+        if self.growth == "newest":
+            older = state["level"] < stage
+            state["grad2d"][older] = 0
+            state["radii"][older] = 0
+        return self._grow_gs(params, optimizers, state, step)
+
+    @torch.no_grad()
+    def _prune(self, params, optimizers: Optimizers, state: dict[str, Any], step: int, stage: int) -> int:
+        opacity = torch.sigmoid(params["opacities"].flatten())
+        threshold = torch.where(state["level"] < stage, self.lower_prune_opa, self.prune_opa)
+        prune = opacity < threshold
+        if step > self.reset_every:
+            largest = torch.exp(params["scales"]).amax(-1)
+            prune |= largest > self.prune_scale3d * state["scene_scale"]
+            if step < self.refine_scale2d_stop_iter:
+                prune |= state["radii"] > self.prune_scale2d
+        for level in range(1, stage + 1):
+            # an empty level could never grow again: its most opaque Gaussian stays
+            rows = torch.where(state["level"] == level)[0]
+            if len(rows) and bool(prune[rows].all()):
+                prune[rows[opacity[rows].argmax()]] = False
+        if bool(prune.any()):
+            remove(params=params, optimizers=optimizers, state=state, mask=prune)  # pyright: ignore
+        return int(prune.sum())
+
+    @torch.no_grad()
+    def _reset(self, params, optimizers: Optimizers, state: dict[str, Any], stage: int) -> int:
+        """Clamp opacities to twice the prune threshold, and forget their optimizer's state, as `reset_opa` does."""
+        rows = torch.ones_like(state["level"], dtype=torch.bool)
+        if self.reset_levels == "newest":
+            rows = state["level"] == stage
+        limit = torch.logit(torch.tensor(self.prune_opa * 2.0)).item()
+        parameter = params["opacities"]
+        parameter[rows] = parameter[rows].clamp(max=limit)
+        for value in optimizers["opacities"].state[parameter].values():
+            if value.shape == parameter.shape:
+                value[rows] = 0
+        return int(rows.sum())
+
+
+def add_level(params, optimizers: Optimizers, state: dict[str, Any], level: int, opacity: float | None = None) -> int:
+    """Duplicate every Gaussian that is not of `level` with that level (Section 3.2); optimizers start afresh.
+
+    Args:
+        opacity: of the duplicates; None: as their originals.
+
+    Returns:
+        how many were added.
+    """
+    n = len(params["means"])
+    for optimizer in optimizers.values():
+        optimizer.state.clear()
+    duplicate(params, optimizers, state, torch.ones(n, dtype=torch.bool, device=params["means"].device))  # pyright: ignore
+    state["level"][n:] = level
+    if opacity is not None:
+        with torch.no_grad():
+            logit = torch.logit(torch.tensor(opacity)).item()
+            params["opacities"][n:] = params["opacities"][n:].clamp(max=logit)
+    for key in ("grad2d", "count", "radii"):
+        state[key] = None
+    return n

@@ -1,0 +1,62 @@
+"""When things happen in a training run. Step constants are written for REFERENCE_STEPS and scale with the run's length."""
+
+from dataclasses import dataclass
+
+REFERENCE_STEPS = 30_000
+"""length of the papers' runs"""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Steps of one run, already scaled."""
+
+    num_levels: int
+    """levels at the end of training, L"""
+    level_interval: int
+    """K: steps of each stage but the last"""
+    refine_every: int
+    """steps between two refinements (densification and pruning)"""
+    refine_start: int
+    """refinement begins after this step"""
+    refine_stop: int
+    """refinement ends at this step"""
+    refine_pause: int
+    """steps without refinement after a level was added"""
+    reset_every: int
+    """steps between two opacity resets"""
+    reset_stop: int
+    """no opacity reset at or after this step"""
+    screen_size_stop: int
+    """splitting and pruning by screen size ends at this step"""
+    sh_interval: int
+    """steps between two degrees of spherical harmonics"""
+    multiresolution: bool = True
+    """stage m trains at 1 / 2^(L - m) of full size"""
+
+    def stage(self, step: int) -> int:
+        """Levels present at `step`: 1 from the start, one more every K steps, at most L."""
+        return min(1 + step // self.level_interval, self.num_levels)
+
+    def halvings(self, stage: int) -> int:
+        """How often training images are halved in `stage`."""
+        return self.num_levels - stage if self.multiresolution else 0
+
+    def sh_degree(self, step: int, maximum: int) -> int:
+        """Degree of spherical harmonics in use at `step`."""
+        return min(step // self.sh_interval, maximum)
+
+    def refines(self, step: int) -> bool:
+        """Whether `step` is one of refinement, the pause after a new level respected."""
+        stage = self.stage(step)
+        since_level = step - (stage - 1) * self.level_interval
+        paused = stage > 1 and since_level < self.refine_pause
+        return self.refine_start < step < self.refine_stop and step % self.refine_every == 0 and not paused
+
+    def resets(self, step: int) -> bool:
+        """Whether opacities are reset at `step`."""
+        return 0 < step < min(self.reset_stop, self.refine_stop) and step % self.reset_every == 0
+
+
+def scaled(steps: int, scale: float, least: int = 1) -> int:
+    """`steps` of a reference run in a run `scale` times as long, at least `least`."""
+    return max(least, round(steps * scale))
