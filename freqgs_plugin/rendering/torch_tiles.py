@@ -85,13 +85,13 @@ def _row_span(
     tile_y: Int[Tensor, " r"],
 ) -> tuple[Float[Tensor, " r"], Float[Tensor, " r"]]:
     """Leftmost and rightmost x, px, of each pair's ellipse between the first and last pixel centres of its row of tiles."""
-    a, b, c = projected.conics[candidates].unbind(-1)
+    a, b, c = projected.conics.index_select(0, candidates).unbind(-1)
     rx = (reach * projected.cov_xx[candidates]).sqrt()
     ry = (reach * projected.cov_yy[candidates]).sqrt()
     x, y = projected.means2d[candidates].unbind(-1)
     slack = 1e-3 + 1e-6 * (rx + ry + x.abs())
     per_splat = torch.stack([x, y, rx / c * b, ry, reach, a, b, projected.cov_yy[candidates], slack], dim=-1)
-    x, y, lean, ry, reach, a, b, cov_yy, slack = per_splat[pair].unbind(-1)
+    x, y, lean, ry, reach, a, b, cov_yy, slack = per_splat.index_select(0, pair).unbind(-1)
     top = torch.maximum(tile_y * TILE + 0.5 - y, -ry)
     bottom = torch.maximum(torch.minimum(tile_y * TILE + (TILE - 0.5) - y, ry), top)
 
