@@ -24,6 +24,8 @@ class Schedule:
     """steps without refinement after a level was added"""
     reset_every: int
     """steps between two opacity resets"""
+    reset_pause: int
+    """steps without refinement after an opacity reset"""
     reset_stop: int
     """no opacity reset at or after this step"""
     screen_size_stop: int
@@ -50,7 +52,13 @@ class Schedule:
         stage = self.stage(step)
         since_level = step - (stage - 1) * self.level_interval
         paused = stage > 1 and since_level < self.refine_pause
+        paused |= step % self.reset_every < self.reset_pause and self.last_reset(step) > 0
         return self.refine_start < step < self.refine_stop and step % self.refine_every == 0 and not paused
+
+    def last_reset(self, step: int) -> int:
+        """The last step at or before `step` on which opacities were reset; 0: none yet."""
+        last = step // self.reset_every * self.reset_every
+        return last if self.resets(last) else 0
 
     def resets(self, step: int) -> bool:
         """Whether opacities are reset at `step`."""

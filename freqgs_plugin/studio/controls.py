@@ -1,0 +1,65 @@
+"""Viewer controls, and what they say about how to draw. They touch pictures in the viewer only, never training or files."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from nerfstudio.viewer.viewer_elements import ViewerSlider, ViewerText
+
+from freqgs_plugin.functional.attenuation import LevelCut
+
+
+def in_viewer() -> bool:
+    """Whether this is one of the viewer's render threads.
+
+    Training, ns-eval and ns-render call the same model methods; a slider must not change their pictures.
+    """
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine
+
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+def lod_slider(num_levels: int, redraw: Callable[[Any], None]) -> ViewerSlider:
+    """Slider over fractional levels 1..L, at L to begin with."""
+    return ViewerSlider(
+        name="Level of detail",
+        default_value=float(num_levels),
+        min_value=1.0,
+        max_value=float(max(num_levels, 2)),
+        step=0.05,
+        disabled=num_levels == 1,
+        cb_hook=redraw,
+        hint="Draws levels up to this one; a fraction fades the next level in.",
+    )
+
+
+def drawn_text() -> ViewerText:
+    """Read-only text: Gaussians drawn, of how many, and the time it took."""
+    return ViewerText(name="Drawn", default_value="-", disabled=True, hint="Gaussians drawn / all, render time")
+
+
+def level_cut(slider: ViewerSlider) -> LevelCut:
+    """The attenuation that the slider asks for."""
+    return LevelCut(float(slider.value))
+
+
+class Stopwatch:
+    """Milliseconds of a block, with CUDA's queue emptied before and after."""
+
+    def __init__(self, device: torch.device):
+        self._cuda = device.type == "cuda"
+        self.milliseconds = 0.0
+
+    def _now(self) -> float:
+        if self._cuda:
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+    def __enter__(self) -> "Stopwatch":
+        self._start = self._now()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.milliseconds = (self._now() - self._start) * 1e3

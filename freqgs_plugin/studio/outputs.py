@@ -1,0 +1,37 @@
+"""Named outputs that are rendered only when somebody reads them."""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import torch
+
+
+class LazyOutputs(dict[str, Any]):
+    """A dict of outputs; a value given as a function is computed when it is first read, without gradients.
+
+    The viewer lists all names and reads one. ns-render reads those it was asked for.
+    """
+
+    def __init__(self, ready: Mapping[str, Any], later: Mapping[str, Callable[[], Any]]):
+        super().__init__({**ready, **dict.fromkeys(later)})
+        self._later = dict(later)
+
+    def __getitem__(self, name: str) -> Any:
+        make = self._later.pop(name, None)
+        if make is not None:
+            with torch.no_grad():
+                self[name] = make()
+        return super().__getitem__(name)
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self._later.pop(name, None)
+        super().__setitem__(name, value)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if name in self else default
+
+    def items(self) -> Iterator[tuple[str, Any]]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return ((name, self[name]) for name in list(self))
+
+    def values(self) -> Iterator[Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return (self[name] for name in list(self))

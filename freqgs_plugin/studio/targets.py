@@ -1,0 +1,47 @@
+"""What a training view is compared with, kept from step to step while it stays the same."""
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from freqgs_plugin.training.objective import PyramidTargets
+
+
+@dataclass(frozen=True)
+class ViewTarget:
+    """One view's image and mask at the stage's size, and their pyramid."""
+
+    image: Tensor
+    mask: Tensor | None
+    pyramid: PyramidTargets
+
+    def megabytes(self) -> float:
+        parts = [self.image, self.mask, self.pyramid.magnitudes, *self.pyramid.reduced]
+        return sum(p.numel() * p.element_size() for p in parts if p is not None) / 2**20
+
+
+class TargetCache:
+    """Targets by view, up to a bound on memory."""
+
+    def __init__(self, megabytes: float):
+        self._bound = megabytes
+        self._used = 0.0
+        self._kept: dict[Hashable, ViewTarget] = {}
+
+    def clear(self) -> None:
+        self._kept.clear()
+        self._used = 0.0
+
+    def get(
+        self, key: Hashable | None, make: Callable[[], tuple[Tensor, Tensor | None]], levels: int, dft: bool
+    ) -> ViewTarget:
+        """The target under `key`, made by `make` (image [h, w, 3], mask [h, w, 1]) if it is not there; None: not kept."""
+        if key is not None and key in self._kept:
+            return self._kept[key]
+        image, mask = make()
+        target = ViewTarget(image, mask, PyramidTargets.from_image(image, levels, mask, dft=dft))
+        if key is not None and self._used + target.megabytes() <= self._bound:
+            self._kept[key] = target
+            self._used += target.megabytes()
+        return target
