@@ -1,7 +1,7 @@
 """Perspective projection of 3D Gaussians to 2D ones: EWA splatting as in gsplat's `fully_fused_projection`.
 
-Everything is elementwise on unbound components: batches of 3x3 products are slow on a CPU. The determinant of the projected
-covariance is a cross product, because `a c - b^2` loses every digit for needle-shaped Gaussians.
+Everything is elementwise on unbound components: batches of 3x3 products are slow on a CPU. The determinant of the
+projected covariance is a cross product, because `a c - b^2` loses every digit for needle-shaped Gaussians.
 """
 
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ def rotation_rows(quats: Float[Tensor, "n 4"]) -> list[list[Float[Tensor, " n"]]
 
     Invariant to the norm down to 1e-20. A zero quaternion gives the identity, with zero gradient.
     """
-    largest = quats.detach().abs().amax(dim=-1, keepdim=True) if quats.numel() else quats.new_zeros(quats.shape[0], 1)
+    largest = quats.detach().abs().amax(dim=-1, keepdim=True)
     defined = largest > QUATERNION_MIN
     scaled = torch.where(defined, quats, 0.0) / torch.where(defined, largest, 1.0)
     squared = scaled.square().sum(dim=-1, keepdim=True)
@@ -73,7 +73,7 @@ def project(
     """Project n Gaussians (world units, wxyz) to `camera`; differentiable in means, quats and scales.
 
     cov = J R M M^T R^T J^T + blur I with M = rotation * scales, R the camera's rotation and J the Jacobian of the
-    perspective division at the mean, held within `FOV_MARGIN` of the image (EWA splatting, Zwicker et al. 2001, Eq. 29).
+    perspective division at the mean, held within `FOV_MARGIN` of the image (EWA splatting, Zwicker et al. 2001).
     `blur` is a variance, px^2. Rows that are culled get finite values and no gradient.
     """
     viewmat, intrinsics = camera.viewmat.to(means), camera.K.to(means)
@@ -167,7 +167,7 @@ def _radii(
     drawable: Bool[Tensor, " n"],
     camera: Camera,
 ) -> Int32[Tensor, " n"]:
-    """gsplat's culling radius, px: ceil(3 sqrt(larger eigenvalue)), 0 where the square around the mean misses the image."""
+    """gsplat's radius, px: ceil(3 sqrt(larger eigenvalue)); 0 where the square around the mean misses the image."""
     half_trace = (cov_xx + cov_yy) / 2
     # the floor of 0.01 is gsplat's; it keeps circles from a root of a negative rounding error
     eigenvalue = half_trace + (half_trace.square() - det).clamp_min(0.01).sqrt()

@@ -1,34 +1,17 @@
-"""The reference rasterizer: pure torch, any device, float32 and float64, hand-written backward.
+"""The reference rasterizer: pure torch, any device, float32 and float64, hand-written backward."""
 
-Memory is O(pixels + intersections): the backward pass repeats the forward products front to back and carries what is left
-behind each Gaussian, so nothing is stored per pixel and Gaussian.
-"""
-
-import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from freqgs_plugin.functional.projection import Projected, project
-from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN, BLUR, TRANSMITTANCE_MIN
-from freqgs_plugin.rendering.torch_tiles import TILE, Tiles, bin_splats, chunks_by_length
+from freqgs_plugin.rendering.base import ALPHA_MIN, BLUR
+from freqgs_plugin.rendering.torch_compositing import backward_tiles, forward_tiles, splat_table
+from freqgs_plugin.rendering.torch_tiles import bin_splats
 from freqgs_plugin.types import Camera, Rendering, Splats
-
-PIXELS = TILE * TILE
-GROUP = 512
-"""tiles composited together"""
-STEP = 8
-"""Gaussians per tile composited together: GROUP * STEP * PIXELS numbers fit a CPU's cache"""
-SLAB = 32
-"""Gaussians per tile gathered together"""
-LOG_UNDERFLOW = -30.0
-"""floor of log alpha, far below the threshold: numbers that underflow are slow"""
-INERT = -1e4
-"""log opacity of a padding entry: its alpha underflows to 0"""
 
 
 class TorchRasterizer:
@@ -37,7 +20,7 @@ class TorchRasterizer:
     name = "torch"
 
     def __init__(self, absgrad: bool = True) -> None:
-        """`absgrad`: also sum absolute gradients per pixel into `info["means2d"].absgrad` (a quarter more backward time)."""
+        """`absgrad`: also sum absolute gradients per pixel into `info["means2d"].absgrad` (slower by a quarter)."""
         self.absgrad = absgrad
 
     def __call__(
@@ -99,9 +82,9 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means2d, conics, opacities, features, cov_yy, depths, tiles, size, absgrad):
-        table = _table(means2d[0], conics, opacities, cov_yy)
+        table = splat_table(means2d[0], conics, opacities, cov_yy)
         composited = features if depths is None else torch.cat([features, depths[:, None]], dim=-1)
-        image, transmittance, used = _forward_tiles(table, _with_inert_row(composited), tiles)
+        image, transmittance, used = forward_tiles(table, composited, tiles)
         d = features.shape[1]
         ctx.save_for_backward(means2d, conics, opacities, features, transmittance, used)
         ctx.table, ctx.tiles, ctx.absgrad, ctx.image = table, tiles, absgrad, image[:, :d]
@@ -119,11 +102,11 @@ class _Composite(torch.autograd.Function):
         tiles, d = ctx.tiles, features.shape[1]
         grad = tiles.split(grad_features)
         behind = (grad * ctx.image).sum(1, keepdim=True) + transmittance * tiles.split(grad_transmittance)
-        sums = _backward_tiles(ctx.table, _with_inert_row(features), tiles, used, grad, behind[:, 0], ctx.absgrad)[:-1]
+        sums = backward_tiles(ctx.table, features, tiles, used, grad, behind[:, 0], ctx.absgrad)
         s, sx, sy, sxx, sxy, syy = sums[:, d : d + 6].unbind(-1)
         a, b, c = conics.unbind(-1)
         if ctx.absgrad:
-            means2d.absgrad = sums[None, :, d + 6 :]
+            means2d.absgrad = sums[None, :, d + 6 :].contiguous()
         return (
             torch.stack([a * sx + b * sy, b * sx + c * sy], dim=-1)[None],
             torch.stack([-0.5 * sxx, -sxy, -0.5 * syy], dim=-1),
@@ -131,235 +114,3 @@ class _Composite(torch.autograd.Function):
             sums[:, :d],
             *([None] * 5),
         )
-
-
-def _with_inert_row(x: Float[Tensor, "n d"]) -> Float[Tensor, "n+1 d"]:
-    """Append a row of zeros: what padding entries of a tile's list point at."""
-    return torch.cat([x, x.new_zeros(1, x.shape[1])])
-
-
-def _table(
-    means2d: Float[Tensor, "n 2"],
-    conics: Float[Tensor, "n 3"],
-    opacities: Float[Tensor, " n"],
-    cov_yy: Float[Tensor, " n"],
-) -> Float[Tensor, "n+1 6"]:
-    """Per Gaussian: x, y, p, q, r, log opacity, with half the conic's form as (p dx + q dy)^2 + (r dy)^2.
-
-    r^2 = 1 / (2 cov_yy) needs no difference of nearly equal numbers. The last row is inert.
-    """
-    a, b, _ = conics.unbind(-1)
-    p = (a / 2).sqrt()
-    log_opacity = torch.log(opacities.clamp_min(torch.finfo(opacities.dtype).tiny))
-    table = torch.stack([*means2d.unbind(-1), p, p * b / a, (0.5 / cov_yy).sqrt(), log_opacity], dim=-1)
-    inert = table.new_tensor([[0, 0, 0, 0, 0, INERT]])
-    return torch.cat([table, inert])
-
-
-def _basis(like: Float[Tensor, "..."]) -> Float[Tensor, "6 p"]:
-    """1, x, y, x^2, xy, y^2 at a tile's pixel centres, px from its middle."""
-    axis = torch.arange(TILE, dtype=like.dtype, device=like.device) - (TILE - 1) / 2
-    y, x = (c.reshape(-1) for c in torch.meshgrid(axis, axis, indexing="ij"))
-    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
-
-
-def _take(table: Float[Tensor, "m c"], rows: Int[Tensor, "s b k"]) -> Float[Tensor, "s b k c"]:
-    """`table[rows]`, which is three times slower on a CPU."""
-    return table.index_select(0, rows.view(-1)).view(*rows.shape, -1)
-
-
-class _Scratch:
-    """Buffers that every step writes into: fresh ones would cost more, in page faults, than the arithmetic."""
-
-    def __init__(self, like: Float[Tensor, "..."]) -> None:
-        self._like, self._buffers = like, {}
-
-    def __call__(self, name: str, *shape: int) -> Float[Tensor, "..."]:
-        """A contiguous tensor whose contents are undefined and live until the next call with the same name."""
-        size = math.prod(shape)
-        if name not in self._buffers or self._buffers[name].shape[0] < size:
-            self._buffers[name] = self._like.new_empty(size)
-        return self._buffers[name][:size].view(shape)
-
-
-@dataclass(frozen=True)
-class _Slab:
-    """Coefficients of SLAB consecutive Gaussians for each of b tiles, cut into s steps of k Gaussians."""
-
-    rows: Int[Tensor, "s b k"]
-    """rows of the Gaussians; the inert row behind a list's end"""
-    means: Float[Tensor, "s b k 2"]
-    """relative to the tile's middle, px"""
-    coefficients: Float[Tensor, "s b k 6"]
-    """of log alpha in `_basis`"""
-    may_cap: bool
-    """some opacity is above `ALPHA_MAX`"""
-
-
-def _slab(
-    table: Float[Tensor, "m 6"],
-    tiles: Tiles,
-    group: Int[Tensor, " b"],
-    lengths: Int[Tensor, " b"],
-    begin: int,
-    longest: int,
-) -> _Slab:
-    """Gather Gaussians `begin` to `begin + SLAB` (at most `longest`) of each tile's list."""
-    steps = -(-min(SLAB, longest - begin) // STEP)
-    k = begin + torch.arange(steps * STEP, device=group.device).view(steps, 1, STEP)
-    entries = tiles.rows[(tiles.starts[group][:, None] + k).clamp_max_(tiles.rows.shape[0] - 1)]
-    rows = torch.where(k < lengths[:, None], entries, table.shape[0] - 1)
-    x, y, p, q, r, log_opacity = _take(table, rows).unbind(-1)
-    centre_x, centre_y = tiles.centres(group, table)[:, None].unbind(-1)
-    x, y = x - centre_x, y - centre_y
-    u, v = -(p * x + q * y), -r * y
-    coefficients = torch.stack(
-        [log_opacity - u * u - v * v, -2 * p * u, -2 * (q * u + r * v), -p * p, -2 * p * q, -(q * q + r * r)], dim=-1
-    )
-    return _Slab(rows, torch.stack([x, y], dim=-1), coefficients, bool(log_opacity.max() > math.log(ALPHA_MAX)))
-
-
-def _alpha(
-    slab: _Slab, step: int, basis: Float[Tensor, "6 p"], scratch: _Scratch
-) -> tuple[Float[Tensor, "b k p"], Float[Tensor, "b k p"] | None]:
-    """Alpha with cap and threshold, and 1 where the cap did not cut it (None: nowhere did it)."""
-    _, b, k, _ = slab.coefficients.shape
-    alpha = scratch("alpha", b, k, basis.shape[1])
-    torch.mm(slab.coefficients[step].view(b * k, 6), basis, out=alpha.view(b * k, -1)).clamp_min_(LOG_UNDERFLOW)
-    alpha.exp_()
-    uncapped = None
-    if slab.may_cap:
-        uncapped = scratch("uncapped", *alpha.shape).copy_(alpha).le_(ALPHA_MAX)
-        alpha.clamp_max_(ALPHA_MAX)
-    return torch.nn.functional.threshold_(alpha, ALPHA_MIN, 0.0), uncapped
-
-
-def _weights(
-    alpha: Float[Tensor, "b k p"], front: Float[Tensor, "b p"], scratch: _Scratch
-) -> tuple[Float[Tensor, "b k p"], Float[Tensor, "b k+1 p"]]:
-    """w = alpha T, zero once a pixel is finished, and the transmittances T in front of each Gaussian and behind the last.
-
-    A loop over k: `torch.cumprod` is slower.
-    """
-    b, k, p = alpha.shape
-    transmittance = scratch("transmittance", b, k + 1, p)
-    transmittance[:, 0] = front
-    for i in range(k):
-        before = transmittance[:, i]
-        torch.addcmul(before, alpha[:, i], before, value=-1, out=transmittance[:, i + 1])
-    weight = torch.mul(alpha, transmittance[:, :-1], out=scratch("weight", b, k, p))
-    if transmittance[:, -1].min() <= TRANSMITTANCE_MIN:
-        after = scratch("after", b, k, p).copy_(transmittance[:, 1:])
-        weight.mul_(after.gt_(TRANSMITTANCE_MIN))
-    return weight, transmittance
-
-
-def _forward_tiles(table: Float[Tensor, "m 6"], features: Float[Tensor, "m d"], tiles: Tiles):
-    """Composite all tiles: features [t, d, p], transmittance [t, 1, p], and how far each list was read [t]."""
-    t, d, basis, scratch = tiles.counts.shape[0], features.shape[1], _basis(table), _Scratch(table)
-    image, transmittance = table.new_zeros(t, d, PIXELS), table.new_ones(t, 1, PIXELS)
-    used = tiles.counts.clone()
-    for group in chunks_by_length(tiles.counts, GROUP):
-        lengths = tiles.counts[group]
-        front = table.new_ones(group.shape[0], PIXELS)
-        begin, longest = 0, int(lengths.max())
-        while begin < longest:
-            slab = _slab(table, tiles, group, lengths, begin, longest)
-            colours = _take(features, slab.rows).transpose(2, 3)
-            partial, left = image[group], transmittance[group, 0]
-            for step in range(slab.rows.shape[0]):
-                alpha, _ = _alpha(slab, step, basis, scratch)
-                weight, passing = _weights(alpha, front, scratch)
-                front = passing[:, -1].clone()
-                partial.baddbmm_(colours[step], weight)
-                left -= torch.sum(weight, 1)
-            image[group], transmittance[group, 0] = partial, left
-            begin += SLAB
-            finished = front.amax(1) <= TRANSMITTANCE_MIN
-            used[group[finished]] = lengths[finished].clamp_max(begin)
-            going_on = ~finished & (lengths > begin)
-            group, lengths, front = group[going_on], lengths[going_on], front[going_on]
-            longest = int(lengths.max()) if group.shape[0] else 0
-    return image, transmittance, used
-
-
-def _backward_tiles(
-    table: Float[Tensor, "m 6"],
-    features: Float[Tensor, "m d"],
-    tiles: Tiles,
-    used: Int[Tensor, " t"],
-    grad: Float[Tensor, "t d p"],
-    behind: Float[Tensor, "t p"],
-    absgrad: bool,
-) -> Float[Tensor, "m s"]:
-    """Per Gaussian, summed over pixels: d feature gradients; the moments 1, dx, dy, dx^2, dx dy, dy^2 (d = pixel - mean) of
-    S = alpha dL/dalpha; with `absgrad` two absolute gradients by the 2D mean.
-    """
-    d, basis, scratch = features.shape[1], _basis(table), _Scratch(table)
-    sums = table.new_zeros(table.shape[0], d + 6 + 2 * absgrad)
-    for group in chunks_by_length(used, GROUP):
-        lengths, longest = used[group], int(used[group].max())
-        front, rest, g = table.new_ones(group.shape[0], PIXELS), behind[group], grad[group]
-        g_transposed = g.transpose(1, 2).contiguous()
-        for begin in range(0, longest, SLAB):
-            slab = _slab(table, tiles, group, lengths, begin, longest)
-            colours = _take(features, slab.rows)
-            columns = table.new_empty(*slab.rows.shape, sums.shape[1])
-            for step in range(slab.rows.shape[0]):
-                alpha, uncapped = _alpha(slab, step, basis, scratch)
-                weight, passing = _weights(alpha, front, scratch)
-                front = passing[:, -1].clone()
-                columns[step, ..., :d] = torch.bmm(weight, g_transposed)
-                share, rest = _shares(weight, passing, uncapped, colours[step], g, rest, scratch)
-                columns[step, ..., d : d + 6] = (share.view(-1, PIXELS) @ basis.T).view(*share.shape[:2], 6)
-                if absgrad:
-                    columns[step, ..., d + 6 :] = _absolute(share, slab.coefficients[step], basis, scratch)
-            _centre_moments(columns[..., d : d + 6], slab.means)
-            sums.index_add_(0, slab.rows.view(-1), columns.view(-1, sums.shape[1]))
-    return sums
-
-
-def _shares(
-    weight: Float[Tensor, "b k p"],
-    transmittance: Float[Tensor, "b k+1 p"],
-    uncapped: Float[Tensor, "b k p"] | None,
-    colours: Float[Tensor, "b k d"],
-    grad: Float[Tensor, "b d p"],
-    rest: Float[Tensor, "b p"],
-    scratch: _Scratch,
-) -> tuple[Float[Tensor, "b k p"], Float[Tensor, "b p"]]:
-    """S = alpha dL/dalpha = w (q - R / T_after), and R behind the last Gaussian, where `rest` is R in front of the first."""
-    q = torch.bmm(colours, grad, out=scratch("q", *weight.shape))
-    behind = torch.mul(weight, q, out=scratch("behind", *weight.shape))
-    for i in range(weight.shape[1]):
-        rest = torch.sub(rest, behind[:, i], out=behind[:, i])
-    rest = rest.clone()
-    # a finished pixel's weight is 0, so the smaller bound only keeps 0 / 0 away
-    behind.div_(transmittance[:, 1:].clamp_min_(TRANSMITTANCE_MIN / 2))
-    share = q.sub_(behind).mul_(weight)
-    return (share if uncapped is None else share.mul_(uncapped)), rest
-
-
-def _centre_moments(moments: Float[Tensor, "s b k 6"], means: Float[Tensor, "s b k 2"]) -> None:
-    """Move moments 1, x, y, x^2, xy, y^2 from the tile's middle to the Gaussian's mean, in place."""
-    m, mx, my, mxx, mxy, myy = moments.unbind(-1)
-    x, y = means.unbind(-1)
-    dx, dy = mx - x * m, my - y * m
-    mxx -= x * (mx + dx)
-    mxy -= x * my + y * dx
-    myy -= y * (my + dy)
-    mx.copy_(dx)
-    my.copy_(dy)
-
-
-def _absolute(
-    share: Float[Tensor, "b k p"], coefficients: Float[Tensor, "b k 6"], basis: Float[Tensor, "6 p"], scratch: _Scratch
-) -> Float[Tensor, "b k 2"]:
-    """Sums over pixels of |share d(log alpha)/d(pixel)|: gsplat's `absgrad`, px^-1."""
-    b, k, p = share.shape
-    _, x, y, xx, xy, yy = coefficients.unbind(-1)
-    slopes = scratch("slopes", 2, b * k, p)
-    for i, slope in enumerate(([x, 2 * xx, xy], [y, xy, 2 * yy])):
-        torch.mm(torch.stack(slope, dim=-1).view(b * k, 3), basis[:3], out=slopes[i])
-    slopes = slopes.view(2, b, k, p)
-    return slopes.mul_(share).abs_().sum(-1).permute(1, 2, 0)

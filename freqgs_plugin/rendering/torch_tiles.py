@@ -51,15 +51,16 @@ class Tiles:
 def chunks_by_length(lengths: Int[Tensor, " t"], size: int) -> Iterator[Int[Tensor, " b"]]:
     """Tiles in groups of `size`, longest lists first, so that a group wastes few lanes on shorter ones."""
     order = torch.argsort(lengths, descending=True, stable=True)[: int((lengths > 0).sum())]
-    yield from order.split(size)
+    if order.shape[0]:
+        yield from order.split(size)
 
 
 @torch.no_grad()
 def bin_splats(projected: Projected, opacities: Float[Tensor, " n"], height: int, width: int) -> Tiles:
     """List, for every tile, the Gaussians with a pixel centre where alpha >= 1/255.
 
-    That is the ellipse `d^T conic d <= L` with `L = 2 ln(255 opacity)`. Its span is exact for every row of tiles: first the
-    (Gaussian, row of tiles) pairs are listed, then the tiles that each pair spans.
+    That is the ellipse `d^T conic d <= L` with `L = 2 ln(255 opacity)`. Its span is exact for every row of tiles: first
+    the (Gaussian, row of tiles) pairs are listed, then the tiles that each pair spans.
     """
     across, down = -(-width // TILE), -(-height // TILE)
     candidates = torch.nonzero(projected.visible & (opacities >= ALPHA_MIN)).squeeze(1)
@@ -84,7 +85,7 @@ def _row_span(
     pair: Int[Tensor, " r"],
     tile_y: Int[Tensor, " r"],
 ) -> tuple[Float[Tensor, " r"], Float[Tensor, " r"]]:
-    """Leftmost and rightmost x, px, of each pair's ellipse between the first and last pixel centres of its row of tiles."""
+    """Leftmost and rightmost x, px, of each pair's ellipse between the outer pixel centres of its row of tiles."""
     a, b, c = projected.conics.index_select(0, candidates).unbind(-1)
     rx = (reach * projected.cov_xx[candidates]).sqrt()
     ry = (reach * projected.cov_yy[candidates]).sqrt()
@@ -108,7 +109,7 @@ def _row_span(
 def _tile_range(
     low: Float[Tensor, " m"], high: Float[Tensor, " m"], tiles: int
 ) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
-    """First and last tile (last < first: none) with a pixel centre in [low, high] px along one axis of `tiles` tiles."""
+    """First and last of `tiles` tiles along an axis with a pixel centre in [low, high] px (last < first: none)."""
     size = tiles * TILE
     first = torch.ceil(low - 0.5).clamp(0, size).long()
     last = torch.floor(high - 0.5).clamp(-1, size - 1).long()
