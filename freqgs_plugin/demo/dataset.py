@@ -116,12 +116,13 @@ def seed_points(
 ) -> Points:
     """Points like a structure-from-motion tool would give: on visible surfaces, mostly where there is texture, noisy.
 
-    Each has the colour of the picture it was drawn from, a position error of half a pixel seen from there, and an observation
-    in every view that sees it; those seen by one view only are left out, so there may be fewer than `count`.
+    Each has the colour of the picture it was drawn from, a position error of half a pixel seen from there, and an
+    observation in every view that sees it; points seen by one view only are left out, so fewer than `count` may
+    remain.
     """
     rng = np.random.default_rng(seed + 200)
     depths = [depth_map(world, camera) for camera in cameras]
-    share = np.bincount(np.arange(round(count * 1.15)) % len(cameras), minlength=len(cameras))
+    share = np.bincount(np.arange(2 * count) % len(cameras), minlength=len(cameras))
     drawn = [_draw(c, i, d, int(n), rng) for c, i, d, n in zip(cameras, images, depths, share, strict=True)]
     xyz, rgb = np.concatenate([x for x, _ in drawn]), np.concatenate([c for _, c in drawn])
     chosen = rng.permutation(len(xyz))

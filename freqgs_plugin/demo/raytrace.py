@@ -1,8 +1,9 @@
 """A small ray tracer in numpy: the demo's ground truth, which owes nothing to a rasterizer.
 
 Diffuse shading with a hemisphere of ambient light, soft shadows from a square ceiling lamp, a slight view-dependent
-highlight, and one ray per point of an n x n grid in each pixel. Sub-sample i also uses the i-th point of the lamp, so that
-shadows are soft without noise. Colours are display-referred: no gamma is applied, and sub-samples are averaged as shown.
+highlight, and one ray per point of an n x n grid in each pixel. Sub-sample i also uses the i-th point of the lamp, so
+that shadows are soft without noise. Colours are display-referred: there is no gamma, and sub-samples are averaged as
+shown.
 """
 
 from dataclasses import dataclass
@@ -11,10 +12,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from freqgs_plugin.demo.shapes import Kind, face_size, intersect, surface
-from freqgs_plugin.demo.textures import Texture
+from freqgs_plugin.demo.textures import Number, Texture
 from freqgs_plugin.types import Camera
 
 Vectors = Float[np.ndarray, "n 3"]
+Triple = tuple[Number, Number, Number]
 
 AMBIENT = 0.52
 DIFFUSE = 0.6
@@ -27,7 +29,7 @@ class Surface:
     """How one face of a solid looks."""
 
     texture: Texture
-    tiles: tuple[float, float] = (1.0, 1.0)
+    tiles: tuple[Number, Number] = (1.0, 1.0)
     """repetitions along u and v"""
 
 
@@ -37,19 +39,19 @@ class Solid:
 
     name: str
     kind: Kind
-    centre: tuple[float, float, float]
+    centre: Triple
     """world"""
-    half: tuple[float, float, float]
+    half: Triple
     """half-extents along its own axes (a sphere's and a cylinder's radius), world units"""
     faces: tuple[Surface, ...]
     """in the order of `shapes.Hits.face`; the last one serves all faces beyond"""
-    yaw: float = 0.0
+    yaw: Number = 0.0
     """rotation about world z, degrees"""
-    tilt: float = 0.0
+    tilt: Number = 0.0
     """rotation about its own x before the yaw, degrees"""
-    specular: float = 0.0
+    specular: Number = 0.0
     """strength of the highlight, [0, 1]"""
-    shininess: float = 40.0
+    shininess: Number = 40.0
     """exponent of the highlight"""
 
     @property
@@ -75,8 +77,8 @@ class Solid:
 class Lamp:
     """A square lamp that faces down; light does not fall off with distance."""
 
-    centre: tuple[float, float, float]
-    side: float
+    centre: Triple
+    side: Number
     """world units"""
 
     def point(self, index: int, samples: int) -> Float[np.ndarray, " 3"]:
@@ -94,7 +96,7 @@ class World:
     lamp: Lamp
 
 
-def pixel_rays(camera: Camera, dx: float = 0.5, dy: float = 0.5) -> tuple[Float[np.ndarray, " 3"], Vectors]:
+def pixel_rays(camera: Camera, dx: Number = 0.5, dy: Number = 0.5) -> tuple[Float[np.ndarray, " 3"], Vectors]:
     """Camera centre, and unit directions through the points (x + dx, y + dy) of all pixels, row by row; world."""
     intrinsics, viewmat = camera.K.cpu().double().numpy(), camera.viewmat.cpu().double().numpy()
     y, x = np.mgrid[0 : camera.height, 0 : camera.width]
@@ -171,13 +173,13 @@ def _shade(
 def _material(
     item: Solid, points: Vectors, directions: Vectors, footprint: Float[np.ndarray, " n"]
 ) -> tuple[Vectors, Vectors]:
-    """Albedo and unit normal (towards the viewer). `footprint` is the distance between neighbouring rays, world units."""
+    """Albedo and unit normal (towards the viewer). `footprint`: distance between neighbouring rays, world."""
     hits = surface(item.kind, item.to_unit(points - np.float32(item.centre)))
     normal = (hits.normal / np.float32(item.half)) @ item.rotation.T
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     cosine = -(normal * directions).sum(1)
     normal = np.where(cosine[:, None] < 0, -normal, normal)
-    sizes = face_size(item.kind, np.array(item.half))
+    sizes = face_size(item.kind, np.float32(item.half))
     albedo = np.empty_like(points)
     for face in np.unique(hits.face):
         rows = np.flatnonzero(hits.face == face)

@@ -1,4 +1,4 @@
-"""The demo scene: a room with a laid table, whose things differ in size by a factor of 100 and in texture from none to fine.
+"""The demo scene: a room with a laid table. Sizes differ by a factor of 100, textures go from none to fine.
 
 World: metres, z up, the table's centre above the origin. Everything follows from a seed.
 """
@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from freqgs_plugin.demo.raytrace import Lamp, Solid, Surface, World
-from freqgs_plugin.demo.textures import Texture, checker, gradient, photo, solid, wood
+from freqgs_plugin.demo.raytrace import Lamp, Solid, Surface, Triple, World
+from freqgs_plugin.demo.textures import Number, Texture, checker, gradient, photo, solid, wood
 from freqgs_plugin.types import Camera
 
 TABLE_HEIGHT = 0.75
@@ -26,7 +26,7 @@ def build_world(seed: int = 0) -> World:
     return World(solids, Lamp((0.6, -0.8, ROOM_HEIGHT - 0.01), 1.0))
 
 
-def _plain(texture: Texture, *tiles: float) -> tuple[Surface, ...]:
+def _plain(texture: Texture, *tiles: Number) -> tuple[Surface, ...]:
     return (Surface(texture, (tiles[0], tiles[1]) if tiles else (1.0, 1.0)),)
 
 
@@ -68,7 +68,7 @@ def _furniture(seed: int) -> list[Solid]:
 def _pictures() -> list[Solid]:
     frame = Surface(solid(0.25, 0.18, 0.12))
 
-    def picture(name: str, centre: tuple[float, float, float], width: float, height: float) -> list[Solid]:
+    def picture(name: str, centre: Triple, width: Number, height: Number) -> list[Solid]:
         axis = int(np.argmax(np.abs(centre[:2])))
         half = [width / 2, width / 2, height / 2]
         half[axis] = 0.03
@@ -130,8 +130,8 @@ def _small_things(seed: int) -> list[Solid]:
         for i, colour in enumerate(colours)
     ]  # fmt: skip
     pencils = [
-        Solid(f"pencil {i + 1}", "cylinder", (-0.12 + dx, -0.28 + dy, z + 0.42), (0.009, 0.009, 0.16), _plain(solid(*c)),
-              yaw=yaw, tilt=12)
+        Solid(f"pencil {i + 1}", "cylinder", (-0.12 + dx, -0.28 + dy, z + 0.42), (0.009, 0.009, 0.16),
+              _plain(solid(*c)), yaw=yaw, tilt=12)
         for i, (dx, dy, yaw, c) in enumerate(
             [(0.04, 0.02, 20, colours[0]), (-0.03, 0.04, 150, colours[2]), (0.0, -0.05, 265, colours[3])]
         )
@@ -140,7 +140,7 @@ def _small_things(seed: int) -> list[Solid]:
 
 
 def look_at(
-    eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], width: int, height: int, fov: float = 58.0
+    eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], width: int, height: int, fov: Number = 58.0
 ) -> Camera:
     """A camera at `eye` that sees `target` in its middle, world z up; `fov` is the horizontal angle in degrees."""
     forward = (target - eye) / np.linalg.norm(target - eye)
@@ -170,9 +170,9 @@ def orbit(count: int = 36, width: int = 320, height: int = 240, seed: int = 0) -
 
 
 def zoom_path(
-    world: World, count: int = 48, width: int = 320, height: int = 240, near: float = 0.3, far: float = 3.9
+    world: World, count: int = 48, width: int = 320, height: int = 240, near: Number = 0.3, far: Number = 3.9
 ) -> list[Camera]:
-    """Cameras on a straight line away from the smallest textured things, `near` to `far` metres, geometrically spaced."""
+    """Cameras on a straight line away from the dice, `near` to `far` metres from the first, geometrically spaced."""
     item = next(s for s in world.solids if s.name == ZOOM_TARGET)
     target = np.array(item.centre)
     direction = np.array([0.42, -0.80, 0.42])

@@ -1,7 +1,8 @@
 """Ray intersections of unit solids, with normals and texture coordinates.
 
-A solid is a unit shape scaled by half-extents, turned and moved: the cube [-1, 1]^3, the unit sphere, or the cylinder of
-radius 1 with |z| <= 1. Rays enter in unit coordinates, with directions scaled alike, so that `t` keeps its world meaning.
+A solid is a unit shape scaled by half-extents, turned and moved: the cube [-1, 1]^3, the unit sphere, or the cylinder
+of radius 1 with |z| <= 1. Rays enter in unit coordinates, with directions scaled alike, so that `t` keeps its world
+meaning.
 """
 
 from collections.abc import Callable

@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 Image = Float[np.ndarray, "h w 3"]
+Number = float | int
+Colour = tuple[Number, Number, Number]
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Texture:
         return colours
 
 
-def _halve(image: Image) -> Image:
+def _halve(image: Image) -> Float[np.ndarray, "h2 w2 3"]:
     h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     return image[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3))
 
@@ -65,7 +67,7 @@ def _bilinear(image: Image, uv: Float[np.ndarray, "n 2"], repeat: bool) -> Float
 @lru_cache(maxsize=64)
 def photo(
     name: str,
-    tint: tuple[float, float, float] | None = None,
+    tint: Colour | None = None,
     repeat: bool = False,
     crop: tuple[int, int, int, int] | None = None,
 ) -> Texture:
@@ -86,19 +88,19 @@ def photo(
     return Texture(np.clip(image * np.float32(tint or (1, 1, 1)), 0, 1).astype(np.float32), repeat)
 
 
-def solid(red: float, green: float, blue: float) -> Texture:
+def solid(red: Number, green: Number, blue: Number) -> Texture:
     """One colour."""
     return Texture(np.full((1, 1, 3), (red, green, blue), dtype=np.float32))
 
 
-def gradient(top: tuple[float, float, float], bottom: tuple[float, float, float]) -> Texture:
+def gradient(top: Colour, bottom: Colour) -> Texture:
     """A vertical ramp: the smoothest thing in the scene."""
     ramp = np.linspace(0, 1, 64, dtype=np.float32)[:, None, None]
     image = np.float32(top) * (1 - ramp) + np.float32(bottom) * ramp
     return Texture(np.repeat(image, 64, axis=1))
 
 
-def checker(first: tuple[float, float, float], second: tuple[float, float, float], columns: int, rows: int) -> Texture:
+def checker(first: Colour, second: Colour, columns: int, rows: int) -> Texture:
     """A chessboard of `rows` x `columns` fields, 32 texels each."""
     board = (np.add.outer(np.arange(rows * 32) // 32, np.arange(columns * 32) // 32) % 2)[..., None]
     return Texture(np.where(board == 0, np.float32(first), np.float32(second)).astype(np.float32), repeat=True)

@@ -1,5 +1,6 @@
 """COLMAP models through pycolmap: the sparse/0 folder that nerfstudio's `colmap` dataparser reads."""
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,8 +32,8 @@ class Points:
 def write_colmap(folder: Path, cameras: list[Camera], names: list[str], points: Points) -> None:
     """Write cameras.bin, images.bin and points3D.bin (and what else pycolmap's version writes) into `folder`.
 
-    Views with equal intrinsics and size share one PINHOLE camera. Image ids follow the order of `cameras`, so nerfstudio's
-    interval split takes every eighth of them.
+    Views with equal intrinsics and size share one PINHOLE camera. Image ids follow the order of `cameras`, so that
+    nerfstudio's interval split takes every eighth of them.
 
     Raises:
         ValueError: not one name per camera, or a name twice.
@@ -42,7 +43,7 @@ def write_colmap(folder: Path, cameras: list[Camera], names: list[str], points: 
     import pycolmap
 
     model = pycolmap.Reconstruction()
-    sensors: dict[tuple[float, ...], int] = {}
+    sensors: dict[tuple[float | int, ...], int] = {}
     slots = np.zeros(len(points.point), dtype=np.int64)
     for i, (camera, name) in enumerate(zip(cameras, names, strict=True)):
         rows = np.flatnonzero(points.view == i)
@@ -66,7 +67,31 @@ def write_colmap(folder: Path, cameras: list[Camera], names: list[str], points: 
     model.write_binary(str(folder))
 
 
-def _sensor(model: "Reconstruction", sensors: dict[tuple[float, ...], int], camera: Camera) -> int:
+def check_lengths(folder: Path) -> None:
+    """Walk through the records of images.bin and points3D.bin without reading them.
+
+    pycolmap does not notice the end of a truncated file: it may ask for as much memory as a random number says.
+
+    Raises:
+        ValueError: a file is shorter or longer than its records; the message names it.
+    """
+    for name, fixed, named, element in (("images.bin", 64, True, 24), ("points3D.bin", 43, False, 8)):
+        content = (folder / name).read_bytes()
+        try:
+            (count,) = struct.unpack_from("<Q", content)
+            position = 8
+            for _ in range(count):
+                position += fixed
+                if named:
+                    position = content.index(b"\0", position) + 1
+                position += 8 + element * struct.unpack_from("<Q", content, position)[0]
+        except (struct.error, ValueError) as error:
+            raise ValueError(f"{folder / name} ends too early") from error
+        if position != len(content):
+            raise ValueError(f"{folder / name} has {len(content)} bytes in place of {position}")
+
+
+def _sensor(model: "Reconstruction", sensors: dict[tuple[float | int, ...], int], camera: Camera) -> int:
     """Id of the PINHOLE camera with these intrinsics, added to the model where it is new."""
     import pycolmap
 
