@@ -28,7 +28,8 @@ def prepare(pred: Float[Tensor, "*shape"], mode: Clamp) -> Float[Tensor, "*shape
     """The prediction as the loss sees it. Sums of signed residuals leave [0, 1], where the modes differ:
 
     - `"none"`: unchanged, so the loss also pulls back what a viewer would clamp;
-    - `"hard"`: clamped to [0, 1], gradient 0 outside (the paper's public code);
+    - `"hard"`: clamped to [0, 1], gradient 0 outside (the paper's public code); at exactly 0 and 1 it
+      depends on torch's version;
     - `"straight_through"`: clamped to [0, 1], gradient 1 everywhere.
     """
     if mode == "none":
