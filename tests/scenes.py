@@ -14,7 +14,7 @@ def generator(seed):
 
 
 def camera(width=37, height=29, focal=40.0, centre=(0.0, 0.0), angles=(0.0, 0.0, 0.0), dtype=torch.float64):
-    """A pinhole camera near the origin, looking along +z; `centre` shifts the principal point, px; `angles`: radians."""
+    """A pinhole camera near the origin looking along +z; `centre` shifts the principal point, px; angles in radians."""
     ax, ay, az = angles
     rx = torch.tensor([[1, 0, 0], [0, math.cos(ax), -math.sin(ax)], [0, math.sin(ax), math.cos(ax)]])
     ry = torch.tensor([[math.cos(ay), 0, math.sin(ay)], [0, 1, 0], [-math.sin(ay), 0, math.cos(ay)]])

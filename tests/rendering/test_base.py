@@ -1,0 +1,76 @@
+"""The chooser: what it returns, what it refuses and how it says so, and rasterizers that others register."""
+
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from freqgs_plugin.functional import projection
+from freqgs_plugin.rendering import base
+from freqgs_plugin.rendering.base import Rasterizer, available_rasterizers, get_rasterizer
+
+
+class Custom:
+    name = "custom"
+
+    def __init__(self, absgrad):
+        self.absgrad = absgrad
+
+    def __call__(self, splats, camera, *, background=None, blur=0.3, antialiased=False, depth=True):
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("absgrad", [True, False])
+@pytest.mark.parametrize("device, name, chosen", [
+    ("cpu", "torch", "torch"), ("cpu", "numba", "numba"), ("cpu", "auto", "numba"), ("cuda", "auto", "gsplat"),
+    ("cuda:1", "gsplat", "gsplat"), ("cuda", "torch", "torch"), ("mps", "auto", "torch"), ("meta", "torch", "torch"),
+])  # fmt: skip
+def test_chosen(device, name, chosen, absgrad):
+    rasterizer = get_rasterizer(name, device, absgrad=absgrad)
+    assert rasterizer.name == chosen and rasterizer.absgrad is absgrad
+    assert isinstance(rasterizer, Rasterizer)
+
+
+@pytest.mark.parametrize("device, name, message", [
+    ("cpu", "gsplat", "'gsplat' needs a CUDA device, but the tensors are on 'cpu'.*auto, torch, numba"),
+    ("mps", "gsplat", "'gsplat' needs a CUDA device, but the tensors are on 'mps'.*auto, torch"),
+    ("cuda", "numba", "'numba' runs on the CPU only, but the tensors are on 'cuda'.*auto, torch, gsplat"),
+    ("cpu", "vulkan", "unknown rasterizer 'vulkan'.*auto, torch, numba, gsplat"),
+])  # fmt: skip
+def test_refused(device, name, message):
+    with pytest.raises(ValueError, match=message):
+        get_rasterizer(name, device)
+
+
+def test_registered_by_entry_point(monkeypatch):
+    entry = EntryPoint("custom", f"{__name__}:Custom", base.ENTRY_POINT_GROUP)
+    asked = []
+
+    def entry_points(group):
+        asked.append(group)
+        return [entry]
+
+    monkeypatch.setattr(base, "entry_points", entry_points)
+    monkeypatch.setitem(sys.modules, __name__, sys.modules[Custom.__module__])
+    assert available_rasterizers() == ["torch", "numba", "gsplat", "custom"]
+    rasterizer = get_rasterizer("custom", "cpu", absgrad=False)
+    assert isinstance(rasterizer, Custom) and rasterizer.absgrad is False
+    assert set(asked) == {"freqgs_plugin.rasterizers"}
+    with pytest.raises(ValueError, match="auto, torch, numba, gsplat, custom"):
+        get_rasterizer("other", "cpu")
+
+
+def test_the_projections_constants_are_the_seams():
+    assert projection.NEAR_PLANE == base.NEAR_PLANE
+    assert projection.FOV_MARGIN == base.FOV_MARGIN
+    assert projection.RADIUS_SIGMAS == base.RADIUS_SIGMAS
+
+
+def test_backends_load_on_first_use_only():
+    code = (
+        "import sys, freqgs_plugin.rendering.base, freqgs_plugin.rendering.gsplat_backend\n"
+        "assert not {'gsplat', 'numba', 'nerfstudio'} & set(sys.modules), 'loaded too early'"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,158 @@
+"""The gsplat backend: its call against the installed gsplat's signature, its errors, and on CUDA its pictures."""
+
+import inspect
+import sys
+from types import ModuleType, SimpleNamespace
+
+import gsplat
+import pytest
+import scenes
+import torch
+
+from freqgs_plugin.rendering import gsplat_backend
+from freqgs_plugin.rendering.base import NEAR_PLANE
+from freqgs_plugin.rendering.gsplat_backend import GsplatRasterizer
+
+SIGNATURE = inspect.signature(gsplat.rasterization)
+META_IN_SOURCE = inspect.getsource(gsplat.rasterization)
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """Replaces gsplat.rasterization by one that checks its arguments like the real one, and keeps them in `calls`."""
+    calls = []
+
+    def rasterization(*args, **kwargs):
+        bound = SIGNATURE.bind(*args, **kwargs)
+        bound.apply_defaults()
+        a = bound.arguments
+        calls.append(a)
+        n, d = a["colors"].shape
+        assert a["means"].shape == (n, 3) and a["quats"].shape == (n, 4) and a["scales"].shape == (n, 3)
+        assert a["opacities"].shape == (n,) and a["viewmats"].shape == (1, 4, 4) and a["Ks"].shape == (1, 3, 3)
+        assert a["backgrounds"] is None or a["backgrounds"].shape == (1, d)
+        channels = d + (a["render_mode"] == "RGB+ED")
+        image = torch.arange(channels).float().expand(1, a["height"], a["width"], channels)
+        meta = {
+            "camera_ids": None, "gaussian_ids": None, "radii": rasterization.radii[:, :n],
+            "means2d": torch.zeros(1, n, 2), "depths": torch.ones(1, n), "conics": torch.ones(1, n, 3),
+            "opacities": a["opacities"][None], "tile_width": 1, "tile_height": 1, "tiles_per_gauss": None,
+            "isect_ids": None, "flatten_ids": None, "isect_offsets": None, "width": a["width"],
+            "height": a["height"], "tile_size": 16, "n_cameras": 1,
+        }  # fmt: skip
+        return image, torch.ones(1, a["height"], a["width"], 1), meta
+
+    rasterization.radii = torch.arange(40, dtype=torch.int32)[None]
+    rasterization.calls = calls
+    monkeypatch.setattr(gsplat, "rasterization", rasterization)
+    monkeypatch.setattr(gsplat_backend, "_missing", lambda device: None)
+    return rasterization
+
+
+def scene(**kwargs):
+    return scenes.splats(dtype=torch.float32, **kwargs), scenes.camera(dtype=torch.float32)
+
+
+def test_the_call_matches_gsplats_signature(fake):
+    splats, camera = scene(d=3)
+    rendering = GsplatRasterizer(absgrad=True)(splats, camera, background=torch.ones(3), blur=0.1, antialiased=True)
+    (a,) = fake.calls
+    assert a["sh_degree"] is None and a["packed"] is False and a["absgrad"] is True
+    assert a["rasterize_mode"] == "antialiased" and a["render_mode"] == "RGB+ED"
+    assert a["eps2d"] == 0.1 and a["near_plane"] == NEAR_PLANE
+    assert a["colors"] is splats.features and a["opacities"] is splats.opacities
+    assert rendering.features.shape == (29, 37, 3) and rendering.features[0, 0].tolist() == [0, 1, 2]
+    assert rendering.depth.shape == (29, 37, 1) and rendering.depth[0, 0, 0] == 3 and not rendering.depth.requires_grad
+
+
+def test_without_depth_and_antialiasing(fake):
+    splats, camera = scene(d=5)
+    rendering = GsplatRasterizer(absgrad=False)(splats, camera, depth=False)
+    (a,) = fake.calls
+    assert a["render_mode"] == "RGB" and a["rasterize_mode"] == "classic" and a["absgrad"] is False
+    assert a["backgrounds"] is None
+    assert rendering.features.shape == (29, 37, 5) and not rendering.depth.any()
+
+
+def test_every_info_key_is_one_that_gsplat_sets(fake):
+    rendering = GsplatRasterizer()(*scene())
+    for key in rendering.info:
+        assert f'"{key}": ' in META_IN_SOURCE, key
+    assert set(rendering.info) == {*gsplat_backend._INFO_KEYS, "radii"}
+
+
+def test_radii_of_gsplat_1_5_become_one_per_gaussian(fake):
+    fake.radii = torch.stack([torch.arange(40), torch.arange(40).flip(0)], -1).int()[None]
+    radii = GsplatRasterizer()(*scene()).info["radii"]
+    assert radii.shape == (1, 40) and radii.dtype == torch.int32
+    assert radii[0, 0] == 39 and radii[0, 20] == 20
+
+
+def test_an_empty_scene_is_its_background(fake):
+    splats, camera = scene(n=0)
+    rendering = GsplatRasterizer()(splats, camera, background=torch.tensor([1.0, 2.0, 3.0]))
+    assert not fake.calls
+    assert rendering.features[3, 5].tolist() == [1, 2, 3] and not rendering.alpha.any()
+    assert rendering.info["means2d"].shape == (1, 0, 2) and rendering.info["radii"].shape == (1, 0)
+
+
+def test_float64_is_refused(fake):
+    with pytest.raises(TypeError, match=r"float32 tensors, got torch.float64.*'torch'"):
+        GsplatRasterizer()(scenes.splats(), scenes.camera())
+
+
+def test_cpu_tensors_are_refused_with_what_would_work():
+    with pytest.raises(RuntimeError, match=r"tensors are on 'cpu'.*'torch', or 'numba' on the CPU"):
+        GsplatRasterizer()(*scene())
+
+
+def test_missing_kernels_are_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", SimpleNamespace(_C=None))
+    reason = gsplat_backend._missing(torch.device("cuda"))
+    assert "kernels are not compiled" in reason and "nvcc" in reason
+
+
+def test_kernels_that_do_not_compile_are_named(monkeypatch):
+    class Broken(ModuleType):
+        def __getattr__(self, name):
+            raise IndexError("list index out of range")
+
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", Broken("gsplat.cuda._backend"))
+    reason = gsplat_backend._missing(torch.device("cuda"))
+    assert "cannot be compiled (IndexError: list index out of range)" in reason
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    assert "install gsplat==1.4.0" in gsplat_backend._missing(torch.device("cuda"))
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("name", ["plain", "off_centre", "rotated", "behind", "finished_pixels", "empty"])
+def test_equals_the_reference_on_cuda(name, antialiased, assert_close):
+    from freqgs_plugin.rendering.torch_backend import TorchRasterizer
+
+    splats, camera = scenes.awkward()[name]
+    background = torch.tensor([0.1, 0.2, 0.3])
+    reference = scenes.leaves_of(splats, torch.float64)
+    expected = TorchRasterizer()(reference, camera, background=background.double(), antialiased=antialiased)
+    ours = type(splats)(**{
+        k: getattr(splats, k).detach().float().cuda().requires_grad_() for k in scenes.LEAVES
+    })  # fmt: skip
+    view = type(camera)(camera.viewmat.float().cuda(), camera.K.float().cuda(), camera.width, camera.height)
+    actual = GsplatRasterizer()(ours, view, background=background.cuda(), antialiased=antialiased)
+    for key in ("features", "alpha"):
+        # gsplat lists tiles by a box of 3 standard deviations, not by the ellipse where alpha >= 1/255
+        assert (getattr(actual, key).cpu() - getattr(expected, key)).abs().max() < 0.02, key
+    if len(splats) == 0:
+        return
+    for r in (actual, expected):
+        r.info["means2d"].retain_grad()
+        r.features.square().sum().backward()
+    for key in ("grad", "absgrad"):
+        a, b = (getattr(r.info["means2d"], key).cpu().double() for r in (actual, expected))
+        assert (a - b).norm() < 0.02 * b.norm(), key
+    for key in scenes.LEAVES:
+        a, b = getattr(ours, key).grad.cpu().double(), getattr(reference, key).grad
+        assert (a - b).norm() < 0.02 * b.norm(), key
