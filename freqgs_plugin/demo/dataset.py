@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from freqgs_plugin.demo.raytrace import World, depth_map, render_truth
 from freqgs_plugin.demo.scene import build_world, orbit
+from freqgs_plugin.io.check_images import SceneError
 from freqgs_plugin.io.colmap import Points, write_colmap
 from freqgs_plugin.io.images import to_uint8, write_image
 from freqgs_plugin.types import Camera
@@ -41,12 +42,12 @@ def write_scene(folder: Path, options: SceneOptions | None = None, *, progress: 
     The model in sparse/0 comes last, so a folder left half-written is not mistaken for a scene.
 
     Raises:
-        ValueError: fewer than two views, or a size of zero.
+        SceneError: fewer than two views, or a size of zero.
         FileExistsError: the folder holds something that this function did not write.
     """
     options = options or SceneOptions()
     if options.num_views < 2 or min(options.width, options.height, options.samples, options.num_points) < 1:
-        raise ValueError(f"a scene needs at least two views, one pixel, one ray and one seed point, not {options}")
+        raise SceneError(f"a scene needs at least two views, one pixel, one ray and one seed point, not {options}")
     _claim(folder, options)
     world, cameras = build_world(options.seed), orbit(options.num_views, options.width, options.height, options.seed)
     names = [f"view_{i:03d}.png" for i in range(len(cameras))]

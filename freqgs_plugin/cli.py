@@ -1,0 +1,77 @@
+"""The `freqgs` command. Heavy imports happen inside of the commands, so that `--help` is quick."""
+
+import sys
+from pathlib import Path
+
+
+def demo(
+    output_dir: Path = Path("demo-out"),
+    scene_only: Path | None = None,
+    steps: int = 1500,
+    levels: int = 3,
+    seed: int = 0,
+    views: int = 36,
+    size: tuple[int, int] = (320, 240),
+) -> None:
+    """Show what levels of detail are, on a scene made on the spot: no downloads, no GPU needed.
+
+    Ray-traces photographs of a small room, trains lapsplat on them through ns-train, and writes a contact sheet of the
+    levels and a table of what each costs.
+
+    Args:
+        output_dir: folder for the scene, the trained run, the contact sheet and the report.
+        scene_only: write only the scene, a COLMAP folder, here, and stop.
+        steps: training steps.
+        levels: levels of detail.
+        seed: of the scene and of training.
+        views: photographs; every eighth is held out.
+        size: width and height of the photographs, pixels.
+    """
+    from rich.console import Console
+
+    from freqgs_plugin.demo.dataset import SceneOptions, write_scene
+
+    scene = SceneOptions(num_views=views, width=size[0], height=size[1], seed=seed)
+    if scene_only is not None:
+        write_scene(scene_only, scene)
+        print(f"{scene_only}: {views} photographs. Train with: ns-train lapsplat --data {scene_only} "
+              "colmap --colmap-path sparse/0")  # fmt: skip
+        return
+    from freqgs_plugin.demo.run import DemoOptions, run_demo
+
+    run_demo(DemoOptions(output_dir, scene, steps, levels), Console())
+
+
+COMMANDS = {
+    "demo": demo,
+}
+"""name on the command line -> function; its signature and docstring become the options and the help"""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point. Errors that name their remedy are printed without a traceback; the exit status is then 1."""
+    import tyro.extras
+
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS, prog="freqgs", description="Level of detail for Gaussian splatting.", args=arguments
+        )
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Exception as error:
+        if not _expected(error):
+            raise
+        print(f"freqgs: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+def _expected(error: Exception) -> bool:
+    """Errors raised for the user to read."""
+    from freqgs_plugin.demo.training import TrainingError
+    from freqgs_plugin.io.check_images import SceneError
+
+    return isinstance(error, FileExistsError | TrainingError | SceneError)
+
+
+if __name__ == "__main__":
+    main()
