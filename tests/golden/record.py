@@ -1,7 +1,7 @@
 """Record small pictures that every backend must reproduce: `python tests/golden/record.py [--rasterizer torch]`.
 
-Each .npz holds the splats, the camera and the picture (float32), and says which backend made it, in which dtype and with
-which version. The default is gsplat on CUDA, whose numbers all others follow; `torch` records the float64 reference.
+Each .npz holds the splats, the camera and the picture (float32), and says which backend made it, with which dtype and
+version. The default is gsplat on CUDA, whose numbers all others follow; `torch` records the float64 reference.
 """
 
 import argparse
