@@ -1,6 +1,7 @@
 """The demo from end to end: write the scene, train lapsplat through nerfstudio, show and measure the levels."""
 
 import time
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -127,10 +128,12 @@ def _report(run: TrainingRun, options: DemoOptions, seconds: dict[str, float], c
     from freqgs_plugin.studio.checkpoint import load_run
 
     out = options.output_dir
-    trained = load_run(run.config_path)
-    views = trained.cameras("test")
-    step = max(len(views) // SHEET_VIEWS, 1)
-    contact_sheet(out / "contact_sheet.png", trained, views[::step][:SHEET_VIEWS])
+    # nerfstudio's remarks on loading belong to the log
+    with (out / "train.log").open("a", encoding="utf-8") as log, redirect_stdout(log):
+        trained = load_run(run.config_path)
+        views, num_train = trained.cameras("test"), len(trained.cameras("train"))
+    shown = sorted({round(i * (len(views) - 1) / (SHEET_VIEWS - 1)) for i in range(SHEET_VIEWS)})
+    contact_sheet(out / "contact_sheet.png", trained, [views[i] for i in shown])
     rows = prefix_rows(trained, views)
     write_report(
         out / "report.json",
@@ -140,7 +143,7 @@ def _report(run: TrainingRun, options: DemoOptions, seconds: dict[str, float], c
         rasterizer=trained.rasterizer.name,
         steps=options.steps,
         scene=asdict(options.scene),
-        views={"train": len(trained.cameras("train")), "test": len(views)},
+        views={"train": num_train, "test": len(views)},
         seconds=seconds,
     )
     console.print(prefix_table(rows))

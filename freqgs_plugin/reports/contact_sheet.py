@@ -19,14 +19,14 @@ LABEL = 22
 
 
 def view_pictures(run: TrainedRun, view: HeldOutView) -> list[tuple[str, Picture]]:
-    """Labelled pictures of one view: photograph, prefixes, bands above the base around mid-grey, colour by level."""
+    """Labelled pictures of one view: photo, prefixes, bands above the base around mid-grey, colour by level."""
     last = run.num_levels
 
     def shown(image: torch.Tensor) -> Picture:
         return image.clamp(0, 1).float().cpu().numpy()
 
-    pictures = [("photograph", shown(view.image))]
-    for level in range(last, 0, -1):
+    pictures = [("photo", shown(view.image))]
+    for level in range(1, last + 1):
         name = "level 1" if level == 1 else f"levels 1-{level}"
         pictures.append((name, shown(prefix(run, view.camera, level))))
     for level in range(2, last + 1):
@@ -43,7 +43,7 @@ def contact_sheet(path: Path, run: TrainedRun, views: Sequence[HeldOutView]) -> 
     """
     if not views:
         raise ValueError("no held-out views for a contact sheet; choose an evaluation split that holds some back")
-    write_sheet(path, [(view.name, view_pictures(run, view)) for view in views])
+    write_sheet(path, [(Path(view.name).stem, view_pictures(run, view)) for view in views])
 
 
 def write_sheet(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, Picture]]]]) -> None:

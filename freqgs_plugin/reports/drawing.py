@@ -1,6 +1,6 @@
 """Pictures of a trained run, as reports show and measure them."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -16,6 +16,7 @@ from freqgs_plugin.types import Camera, Gaussians, Rendering
 LEVEL_COLOURS = ((0.90, 0.62, 0.00), (0.34, 0.71, 0.91), (0.00, 0.62, 0.45), (0.80, 0.47, 0.65), (0.94, 0.89, 0.26))
 
 
+@runtime_checkable
 class TrainedRun(Protocol):
     """What a report needs of a run (`studio.checkpoint.Run` has it)."""
 
@@ -26,6 +27,7 @@ class TrainedRun(Protocol):
     antialiased: bool
 
 
+@runtime_checkable
 class HeldOutView(Protocol):
     """A view with its photograph (`studio.checkpoint.View`)."""
 
