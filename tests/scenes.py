@@ -69,6 +69,7 @@ def awkward():
     quats[0], quats[1], quats[2] = 0.0, quats[1] * 1e-12, quats[2] * 1e6
     needles = base.scales.clone()
     needles[::2] = torch.tensor([1e-8, 1e-3, 2.0], dtype=base.scales.dtype)
+    wide = splats(12, seed=9, size=(3.0, 9.0))
     dense = splats(400, seed=3, size=(0.1, 0.6))
     return {
         "plain": (base, camera()),
@@ -80,6 +81,7 @@ def awkward():
         "zero_quaternion": (replace(base, quats=quats), camera()),
         "needles": (replace(base, scales=needles), camera()),
         "finished_pixels": (replace(dense, opacities=dense.opacities.clamp_min(0.4)), camera()),
+        "capped": (replace(wide, opacities=wide.opacities * 0 + 1.0), camera()),
         "outside": (replace(base, means=base.means * base.means.new_tensor([3.0, 3.0, 1.0])), camera()),
         "one_pixel": (base, camera(1, 1)),
         "one_row": (base, camera(50, 1)),
