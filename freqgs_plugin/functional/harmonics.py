@@ -62,6 +62,16 @@ def evaluate(sh: Float[Tensor, "n k 3"], offsets: Float[Tensor, "n 3"]) -> Float
     degree = round(sh.shape[1] ** 0.5) - 1
     if degree == 0:
         return C0 * sh[:, 0]
+    if sh.device.type == "cpu" and sh.dtype == offsets.dtype == torch.float32 and degree <= 3:
+        from freqgs_plugin.functional.compiled_harmonics import CompiledHarmonics
+
+        return CompiledHarmonics.apply(sh, offsets)
+    return evaluate_in_torch(sh, offsets)
+
+
+def evaluate_in_torch(sh: Float[Tensor, "n k 3"], offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """`evaluate` on any device and in any dtype."""
+    degree = round(sh.shape[1] ** 0.5) - 1
     directions = torch.nn.functional.normalize(offsets, dim=-1)
     return (basis(directions, degree)[:, :, None] * sh).sum(1)
 

@@ -6,15 +6,16 @@ deviation 1.5 px, only windows that lie inside the image, K = (0.01, 0.03), mean
 """
 
 from functools import lru_cache
-from typing import Literal, no_type_check
+from typing import Literal
 
-import numba
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from freqgs_plugin.functional.numba_threads import njit, prange
 
 _TAPS = 11
 _SIGMA = 1.5
@@ -132,8 +133,7 @@ class _CompiledSSIM(torch.autograd.Function):
         return ctx.saved_tensors[0] * upstream, None, None, None
 
 
-@numba.njit(fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-@no_type_check
+@njit(fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
 def _blur_along(line, taps, out):
     t0, t1, t2, t3, t4, t5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
     for j in range(out.size):
@@ -142,8 +142,7 @@ def _blur_along(line, taps, out):
         out[j] = near + far
 
 
-@numba.njit(fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-@no_type_check
+@njit(fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
 def _blur_across(lines, taps, out):
     t0, t1, t2, t3, t4, t5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
     for j in range(out.size):
@@ -152,8 +151,7 @@ def _blur_across(lines, taps, out):
         out[j] = near + far
 
 
-@numba.njit(fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-@no_type_check
+@njit(fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
 def _similarity_of_row(x, y, xx, yy, xy, by_x, by_xx, by_xy, out):
     """SSIM of one row of windows from the five blurred maps, and its derivatives by the means of x, x^2 and x y."""
     scalar = x.dtype.type
@@ -171,13 +169,12 @@ def _similarity_of_row(x, y, xx, yy, xy, by_x, by_xx, by_xy, out):
         by_x[j] = two * ((b * structure - a * value) * per_luminance + (a * value - b * luminance) * per_variance)
 
 
-@numba.njit(parallel=True, fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-@no_type_check
+@njit(parallel=True, fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
 def _similarity(x, y, rows, columns, sums, slopes):
     """Per strip of windows: blur every row of x, y, x^2, y^2, x y, then down the strip, then SSIM and derivatives."""
     planes, height, width = x.shape
     strips, wide, tall = sums.shape[1], width - 10, height - 10
-    for task in numba.prange(planes * strips):
+    for task in prange(planes * strips):
         p, top = task // strips, task % strips * _STRIP
         count = min(_STRIP, tall - top)
         blurred = np.empty((5, count + 10, wide), x.dtype)
@@ -199,13 +196,12 @@ def _similarity(x, y, rows, columns, sums, slopes):
             sums[p, task % strips] += maps[5].sum()
 
 
-@numba.njit(parallel=True, fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-@no_type_check
+@njit(parallel=True, fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
 def _similarity_backward(x, y, rows, columns, slopes, out):
     """Blurs the three derivative maps back onto the pixels: d/dx = by_x + 2 x by_xx + y by_xy."""
     planes, height, width = x.shape
     strips, two = (height + _STRIP - 1) // _STRIP, x.dtype.type(2)
-    for task in numba.prange(planes * strips):
+    for task in prange(planes * strips):
         p, top = task // strips, task % strips * _STRIP
         count = min(_STRIP, height - top)
         blurred = np.empty((3, count + 10, width), x.dtype)

@@ -5,15 +5,15 @@ as it occurs in the full plane, so they equal those over `fft2` for even and odd
 pixel. Half precision is raised to float32: a sum over 10^5 pixels has no place in 10 bits.
 """
 
-from typing import Literal, no_type_check
+from typing import Literal
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.functional.pyramid import laplacian
 
 
@@ -154,8 +154,7 @@ def _paired_spectrum(image: Tensor) -> Tensor:
     return torch.view_as_real(torch.fft.fft2(torch.view_as_complex(pairs)))
 
 
-@numba.njit(error_model="numpy", cache=True, nogil=True)
-@no_type_check
+@njit(error_model="numpy", cache=True, nogil=True)
 def _unpair(here, mirrored):
     """Spectra a, b of two real planes at k, from that of plane + i * plane at k and at -k; each (real, imaginary)."""
     half = here.dtype.type(0.5)
@@ -164,11 +163,10 @@ def _unpair(here, mirrored):
     return a, b
 
 
-@numba.njit(parallel=True, error_model="numpy", cache=True, nogil=True)
-@no_type_check
+@njit(parallel=True, error_model="numpy", cache=True, nogil=True)
 def _magnitudes(spectrum, out):
     pairs, height, width = spectrum.shape[:3]
-    for task in numba.prange(pairs * height):
+    for task in prange(pairs * height):
         p, u = task // height, task % height
         here, mirrored = spectrum[p, u], spectrum[p, (height - u) % height]
         for v in range(width // 2 + 1):
@@ -178,8 +176,7 @@ def _magnitudes(spectrum, out):
                 out[2 * p + 1, u, v] = np.sqrt(b[0] * b[0] + b[1] * b[1])
 
 
-@numba.njit(error_model="numpy", cache=True, nogil=True)
-@no_type_check
+@njit(error_model="numpy", cache=True, nogil=True)
 def _difference(value, target):
     """| |F| - T | and the derivative by F, sign(|F| - T) F / |F|, which is 0 where |F| is 0."""
     size = np.sqrt(value[0] * value[0] + value[1] * value[1])
@@ -187,13 +184,12 @@ def _difference(value, target):
     return abs(size - target), slope * value[0], slope * value[1]
 
 
-@numba.njit(parallel=True, error_model="numpy", cache=True, nogil=True)
-@no_type_check
+@njit(parallel=True, error_model="numpy", cache=True, nogil=True)
 def _compare(spectrum, target, sums, slopes):
     """Sums of | |F| - T | per row of the full plane, and the derivatives as the spectrum of plane + i * plane."""
     pairs, height, width = spectrum.shape[:3]
     zero = spectrum.dtype.type(0)
-    for task in numba.prange(pairs * height):
+    for task in prange(pairs * height):
         p, u, opposite = task // height, task % height, (height - task % height) % height
         here, mirrored = spectrum[p, u], spectrum[p, opposite]
         for v in range(width // 2 + 1):

@@ -14,11 +14,11 @@ from numba import get_num_threads
 from rich.console import Console
 from torch import Tensor
 
+from freqgs_plugin.functional.numba_threads import check_layer
 from freqgs_plugin.rendering.base import BLUR, Statistics
 from freqgs_plugin.rendering.numba_binning import depth_order, tile_lists
 from freqgs_plugin.rendering.numba_compositing import composite, composite_backward
 from freqgs_plugin.rendering.numba_projection import COLUMNS, OPACITY, V_COLUMNS, project, project_backward
-from freqgs_plugin.rendering.numba_threads import check_layer, choose_layer
 from freqgs_plugin.types import Camera, Rendering, Splats
 
 _CHANNELS = 3
@@ -73,7 +73,9 @@ class _Composite(torch.autograd.Function):
     """(splats, means2d probe, view matrix) -> features [prefixes, h, w, d], light [prefixes, h, w], depth [h, w]."""
 
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, features, means2d, viewmat, view: _View, depths, with_depth, probe):
+    def forward(
+        ctx, means, quats, scales, opacities, features, means2d, viewmat, view: _View, depths, with_depth, probe
+    ):
         shape = (view.prefixes, view.height, view.width)
         light, depth = torch.empty(shape), torch.zeros(shape[1:])
         images = []
@@ -230,9 +232,7 @@ class NumbaRasterizer:
             "n_cameras": 1,
             "tile_size": 16,
         }
-        return [
-            Rendering(features[k], alpha[k], expected, info if k == prefixes - 1 else {}) for k in range(prefixes)
-        ]
+        return [Rendering(features[k], alpha[k], expected, info if k == prefixes - 1 else {}) for k in range(prefixes)]
 
 
 _warm = False
@@ -249,7 +249,6 @@ def warm_up() -> None:
     console = Console(stderr=True)
     if not cached:
         console.print("Compiling the CPU rasterizer (once, about 20 seconds; later starts load it from a cache) ...")
-    choose_layer()
     try:
         _render_speck()
     except ValueError as error:
@@ -275,5 +274,6 @@ def _render_speck() -> None:
     ]
     splats = Splats(*(leaf.requires_grad_() for leaf in leaves))
     camera = Camera(torch.eye(4), torch.eye(3), 1, 1)
-    rasterizer(splats, camera).features.sum().backward()
+    with torch.enable_grad():
+        rasterizer(splats, camera).features.sum().backward()
     rasterizer.prefixes(splats, torch.ones(1, dtype=torch.int32), 2, camera)

@@ -7,8 +7,8 @@ back, equal depths by row. Each entry carries a box: which rows and which 8-pixe
 import math
 
 import numpy as np
-from numba import njit, prange
 
+from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.rendering.base import ALPHA_MIN
 from freqgs_plugin.rendering.numba_projection import HALF_A, HALF_C, OPACITY, REACH_X, REACH_Y, B, X, Y
 

@@ -9,8 +9,8 @@ box of rows in a strip is contiguous.
 """
 
 import numpy as np
-from numba import njit, prange
 
+from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from freqgs_plugin.rendering.numba_binning import STRIP, TILE
 from freqgs_plugin.rendering.numba_projection import (
@@ -160,7 +160,9 @@ def _all_finished(scratch, prefixes, stride):
 
 
 @njit(parallel=True, fastmath=_FAST, error_model="numpy", cache=True)
-def composite(offsets, ids, boxes, splats, depths, level, prefixes, features, with_depth, width, height, image, light, depth):
+def composite(
+    offsets, ids, boxes, splats, depths, level, prefixes, features, with_depth, width, height, image, light, depth
+):
     """Fill `image` [prefixes, h, w, 3], `light` (final transmittance) [prefixes, h, w] and, if asked, `depth` [h, w].
 
     `level` [n] in 1..prefixes; with one prefix and all levels 1 this is plain compositing. Depth needs one prefix.

@@ -8,8 +8,8 @@ each Gaussian is projected in float64 because that costs little here and covaria
 import math
 
 import numpy as np
-from numba import njit, prange
 
+from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.rendering.base import ALPHA_MIN, FOV_MARGIN, NEAR_PLANE, RADIUS_SIGMAS
 
 # columns of a projected Gaussian: centre (px), conic / 2 on the diagonal, opacity after compensation, and the half-width
@@ -115,7 +115,9 @@ def _project_one(
 
 
 @njit(parallel=True, error_model="numpy", fastmath={"contract"}, cache=True)
-def project(means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, out, conics, depths, radii):
+def project(
+    means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, out, conics, depths, radii
+):
     """Fill `out` [n, COLUMNS], `conics` [n, 3], `depths` [n] and `radii` [n] (px, 0 where culled)."""
     for i in prange(means.shape[0]):
         _project_one(

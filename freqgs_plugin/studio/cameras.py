@@ -8,9 +8,7 @@ from torch import Tensor
 from freqgs_plugin.types import Camera
 
 
-def to_camera(
-    camera: Cameras, camera_to_world: Float[Tensor, "1 3 4"] | None = None, *, halvings: int = 0
-) -> Camera:
+def to_camera(camera: Cameras, camera_to_world: Float[Tensor, "1 3 4"] | None = None, *, halvings: int = 0) -> Camera:
     """The pinhole view of a single nerfstudio camera (OpenGL axes: x right, y up, z backward).
 
     Args:

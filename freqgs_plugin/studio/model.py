@@ -79,7 +79,9 @@ class FreqSplatModel(SplatfactoModel):
                 colours = torch.full_like(points, 0.5)
         else:
             points, colours = random_points(self.config.num_random, self.config.random_scale, generator)
-            CONSOLE.log(f"No seed points in use: {len(points)} random ones in a cube of side {self.config.random_scale}.")
+            CONSOLE.log(
+                f"No seed points in use: {len(points)} random ones in a cube of side {self.config.random_scale}."
+            )
         self.gauss_params = torch.nn.ParameterDict(
             initial_parameters(points, colours, self.config.sh_degree, generator)
         )
@@ -292,7 +294,7 @@ class FreqSplatModel(SplatfactoModel):
             value = state["strategy"].get(key)
             self.strategy_state[key] = None if value is None else value.to(self.device)
 
-    def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # pyright: ignore  # noqa: A002
+    def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # pyright: ignore
         if "level" not in dict or "_extra_state" not in dict:
             raise ValueError(
                 "the checkpoint holds no levels: it was not made by this method. "

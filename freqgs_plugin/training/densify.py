@@ -51,7 +51,12 @@ class LevelStrategy(DefaultStrategy):
         state["radii"] = torch.maximum(state["radii"], torch.where(seen, screen, 0.0))
 
     def step(
-        self, params: MutableMapping[str, Any], optimizers: Optimizers, state: dict[str, Any], step: int, schedule: Schedule
+        self,
+        params: MutableMapping[str, Any],
+        optimizers: Optimizers,
+        state: dict[str, Any],
+        step: int,
+        schedule: Schedule,
     ) -> dict[str, int]:
         """Refine and reset as `schedule` says. Returns counts: duplicated, split, pruned, reset."""
         done = {}

@@ -1,17 +1,29 @@
-"""Which threads numba runs on. Import this before any kernel is compiled.
+"""Which threads numba runs on. Take `njit` and `prange` from here: importing this chooses the threading layer.
 
 Viewer and training are two threads that render at the same time. numba's `workqueue` layer aborts the process then, and
 `omp` (GNU OpenMP) kills a child that is forked after first use; `tbb` allows both. The `tbb` wheel puts its library where
-the dynamic linker does not look, so numba alone would not find it: it is loaded by path here.
+the dynamic linker does not look, so numba alone would not find it: it is
+loaded by path here.
 """
 
 import ctypes
+import inspect
 import os
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, files
+from typing import Any
 
 import numba
+from numba import prange
+
+__all__ = ["check_layer", "njit", "prange"]
 
 _LIBRARIES = ("libtbb.so.12", "libtbb.12.dylib", "tbb12.dll")
+
+
+def njit(**options: Any) -> Callable[[Any], Any]:
+    """numba's `njit`, without the wrapper that the tests' run-time type checker puts round every function."""
+    return lambda function: numba.njit(**options)(inspect.unwrap(function))
 
 
 def _load_tbb() -> bool:
@@ -29,7 +41,7 @@ def _load_tbb() -> bool:
     return False
 
 
-def choose_layer() -> None:
+def _choose_layer() -> None:
     """Ask numba for a thread-safe layer, tbb where it is installed. NUMBA_THREADING_LAYER wins."""
     if "NUMBA_THREADING_LAYER" not in os.environ:
         numba.config.THREADING_LAYER = "tbb" if _load_tbb() else "threadsafe"  # pyright: ignore
@@ -48,3 +60,6 @@ def check_layer() -> str:
             "Install tbb (`pip install tbb`) and unset NUMBA_THREADING_LAYER, or use the torch rasterizer."
         )
     return layer
+
+
+_choose_layer()

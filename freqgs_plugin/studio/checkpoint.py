@@ -1,0 +1,101 @@
+"""A trained run as plain Gaussians, cameras and images."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from nerfstudio.utils.eval_utils import eval_setup
+from torch import Tensor
+
+from freqgs_plugin.rendering.base import Rasterizer
+from freqgs_plugin.studio.cameras import to_camera
+from freqgs_plugin.studio.model import FreqSplatModel
+from freqgs_plugin.types import Camera, Gaussians
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph and its camera."""
+
+    name: str
+    camera: Camera
+    image: Float[Tensor, "h w 3"]
+    """in [0, 1]; images with an alpha channel are composited over the run's background"""
+
+
+class Run:
+    """A trained run, loaded. Nothing in it is trained further."""
+
+    def __init__(self, config: Any, pipeline: Any, step: int):
+        self.config = config
+        """nerfstudio's TrainerConfig"""
+        self.step = step
+        """training step of the checkpoint"""
+        self._pipeline = pipeline
+        model = pipeline.model
+        if not isinstance(model, FreqSplatModel):
+            raise ValueError(
+                f"the run was trained by '{config.method_name}', whose model is no level-of-detail model. "
+                "Name a config.yml of a lapsplat run."
+            )
+        self.model: FreqSplatModel = model
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """The scene."""
+        with torch.no_grad():
+            return self.model.gaussians()
+
+    @property
+    def num_levels(self) -> int:
+        """Levels L of the scene."""
+        return int(getattr(self.model, "num_levels", 1))
+
+    @property
+    def background(self) -> Float[Tensor, " 3"]:
+        """What lies behind everything."""
+        return self.model.background_color.to(self.model.device)
+
+    @property
+    def rasterizer(self) -> Rasterizer:
+        """The run's rasterizer, on this machine."""
+        return self.model.rasterizer()
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the run was trained with opacity compensation."""
+        return self.model.antialiased
+
+    def cameras(self, split: Literal["train", "test"]) -> list[View]:
+        """The views of a split, with their images at full size."""
+        manager = self._pipeline.datamanager
+        cached = manager.cached_train if split == "train" else manager.cached_eval
+        dataset = manager.train_dataset if split == "train" else manager.eval_dataset
+        views = []
+        for index, data in enumerate(cached):
+            image = data["image"].to(self.model.device)
+            image = image.float() / 255.0 if image.dtype == torch.uint8 else image
+            image = self.model.composite_with_background(image, self.background)
+            camera = to_camera(dataset.cameras[index : index + 1].to(self.model.device))
+            views.append(View(Path(dataset.image_filenames[index]).name, camera, image))
+        return views
+
+
+def load_run(config_path: Path) -> Run:
+    """Load the latest checkpoint of the run whose `config.yml` is named.
+
+    Raises:
+        FileNotFoundError: there is no such file, or no checkpoint beside it.
+        ValueError: the run is of another method.
+    """
+    config_path = Path(config_path)
+    if not config_path.is_file():
+        raise FileNotFoundError(f"{config_path} is no file; name the config.yml of a trained run.")
+    checkpoints = config_path.parent / "nerfstudio_models"
+    if not any(checkpoints.glob("step-*.ckpt")):
+        raise FileNotFoundError(f"{checkpoints} holds no step-*.ckpt; the run has not saved a checkpoint yet.")
+    config, pipeline, _, step = eval_setup(config_path, test_mode="test")
+    return Run(config, pipeline, step)
