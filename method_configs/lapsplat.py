@@ -2,12 +2,12 @@
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from freqgs_plugin.studio.datamanager import SceneDatamanagerConfig
 from freqgs_plugin.studio.lapsplat import LapSplatModelConfig
 from method_configs.optimizers import splat_optimizers
 
@@ -22,10 +22,9 @@ lapsplat = MethodSpecification(
         mixed_precision=False,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         pipeline=VanillaPipelineConfig(
-            datamanager=FullImageDatamanagerConfig(
+            datamanager=SceneDatamanagerConfig(
                 # every eighth image is held out, as in the papers
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8),
-                cache_images_type="uint8",
             ),
             model=LapSplatModelConfig(),
         ),

@@ -5,7 +5,7 @@ Weights multiply opacities. Two attenuations combine by `Product`.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from torch import Tensor
 from freqgs_plugin.types import Camera, Gaussians
 
 
+@runtime_checkable
 class Attenuation(Protocol):
     """Weight in [0, 1] of every Gaussian for one view."""
 
@@ -27,7 +28,7 @@ class LevelCut:
     Continuous in `level`, and equal to the prefix at whole numbers. At or above the finest level everything is drawn.
     """
 
-    level: float
+    level: float | int
 
     def __post_init__(self) -> None:
         if not self.level >= 0:

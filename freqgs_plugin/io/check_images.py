@@ -114,7 +114,7 @@ def _check_headers(folder: Path, expected: dict[str, tuple[int, int]], factor: i
                     f"image {folder / name} has the Pillow mode {image.mode} (palette, 16-bit grey, CMYK or the like), "
                     "whose values nerfstudio misreads. Convert the images to 8-bit RGB."
                 )
-            elif image.tile and "16" in str(image.tile[0][3]):
+            elif "16B" in str(getattr(image, "tile", "")):
                 deep.append(name)
     if grey:
         warnings.append(f"{len(grey)} grey images, read as RGB with three equal channels: {some(grey)}")

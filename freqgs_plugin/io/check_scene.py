@@ -68,6 +68,8 @@ def check_colmap_scene(
     num_train, num_eval = _count_split(data, images_path, names, eval_mode, eval_interval, train_split_fraction)
     full = {view.name: (model.cameras[view.camera_id].width, model.cameras[view.camera_id].height) for view in views}
     factor, sizes, warnings = check_images(data / images_path, full, downscale_factor, downscale_rounding_mode)
+    if num_eval < 1:
+        warnings.append(f"no view of {data} is held out: training works, evaluation does not")
     num_points, num_duplicates = _check_points(model, data / colmap_path, load_3D_points, warnings)
     return SceneSummary(
         num_views=len(views),
@@ -108,12 +110,22 @@ def _read_model(data: Path, colmap_path: Path) -> "Reconstruction":
     return model
 
 
-def _hint(data: Path) -> str:
-    """What to do about a missing model."""
-    candidates = ("sparse/0", "colmap/sparse/0", "sparse", "colmap/sparse", "colmap", ".")
+_CANDIDATES = ("colmap/sparse/0", "sparse/0", "sparse", "colmap/sparse", "colmap", ".")
+
+
+def find_model(data: Path, candidates: tuple[str, ...] = _CANDIDATES) -> str | None:
+    """The first of `candidates`, folders within `data`, that holds a COLMAP model; None where none does."""
     for candidate in candidates:
         if any((data / candidate / f"cameras.{form}").is_file() for form in ("txt", "bin")):
-            return f"There is one in {data / candidate}: end the command with `colmap --colmap-path {candidate}`."
+            return candidate
+    return None
+
+
+def _hint(data: Path) -> str:
+    """What to do about a missing model."""
+    found = find_model(data)
+    if found is not None:
+        return f"There is one in {data / found}: end the command with `colmap --colmap-path {found}`."
     if (data / "transforms.json").is_file():
         return "There is a transforms.json: use the `nerfstudio-data` dataparser in place of `colmap`."
     return "Run COLMAP, or `ns-process-data images`, on the photographs first."
@@ -149,7 +161,7 @@ def _count_split(
     elif mode == "fraction":
         train = math.ceil(len(names) * fraction)
         evaluation = len(names) - train
-        reason, remedy = f"--train-split-fraction {fraction} leaves", "Choose a fraction between 0 and 1."
+        reason, remedy = f"--train-split-fraction {fraction} leaves", "Choose a fraction above 0."
     elif mode == "filename":
         train = sum("train" in Path(n).name for n in names)
         odd = [n for n in names if "train" not in Path(n).name and "eval" not in Path(n).name]
@@ -161,10 +173,8 @@ def _count_split(
         reason, remedy = "--eval-mode filename leaves", "Rename images or choose another --eval-mode."
     else:
         return len(names), len(names)
-    if train < 1 or evaluation < 1:
-        raise SceneError(
-            f"{reason} {train} of {len(names)} views of {data} to train on and {evaluation} to evaluate with. {remedy}"
-        )
+    if train < 1:
+        raise SceneError(f"{reason} {train} of {len(names)} views of {data} to train on. {remedy}")
     return train, evaluation
 
 
@@ -186,18 +196,13 @@ def _count_lists(lists: list[Path], names: list[str]) -> tuple[int, int]:
 def _check_points(model: "Reconstruction", folder: Path, wanted: bool, warnings: list[str]) -> tuple[int, int]:
     """Number of points, and of those that repeat another one's place."""
     xyz = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    if len(xyz) == 0 and wanted:
-        raise SceneError(
-            f"the COLMAP model in {folder} has no points, on which nerfstudio's dataparser fails. "
-            "End the command with `colmap --load-3D-points False`; Gaussians then start at random places."
-        )
     if not np.isfinite(xyz).all():
         raise SceneError(
             f"{(~np.isfinite(xyz)).any(1).sum()} points of {folder} are not finite; export the model again"
         )
     if len(xyz) == 0 or not wanted:
-        warnings.append(f"no points are read from {folder}; Gaussians start at random places")
-        return len(xyz), 0
+        warnings.append(f"no points are read from {folder}: Gaussians start at random places")
+        return 0, 0
     duplicates = len(xyz) - len(np.unique(xyz, axis=0))
     if duplicates:
         warnings.append(f"{duplicates} of {len(xyz)} points of {folder} lie exactly on another one")

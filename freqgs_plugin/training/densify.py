@@ -4,7 +4,7 @@ Levels are an integer tensor, not a parameter: gsplat's operators copy tensors o
 that they duplicate, split or remove, so the tags travel there.
 """
 
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -52,7 +52,7 @@ class LevelStrategy(DefaultStrategy):
 
     def step(
         self,
-        params: MutableMapping[str, Any],
+        params: Any,
         optimizers: Optimizers,
         state: dict[str, Any],
         step: int,

@@ -195,7 +195,6 @@ def test_one_view_is_too_few(tmp_path):
     [
         ({"eval_interval": 1}, "--eval-interval 1 leaves 0 of 9 views .* interval of 2 or more"),
         ({"eval_mode": "fraction", "train_split_fraction": 0.0}, "leaves 0 of 9 views"),
-        ({"eval_mode": "fraction", "train_split_fraction": 1.0}, "0 to evaluate with"),
         ({"eval_mode": "filename"}, "view_000.png.* hold neither train nor eval"),
     ],
 )
@@ -208,6 +207,12 @@ def test_all_views_may_serve_for_both(scene):
     assert (summary.num_train, summary.num_eval) == (9, 9)
 
 
+def test_no_view_held_out_is_a_warning(scene):
+    summary = check(scene, eval_mode="fraction", train_split_fraction=1.0)
+    assert (summary.num_train, summary.num_eval) == (9, 0)
+    assert "no view" in summary.warnings[0]
+
+
 def test_split_lists(scene):
     (scene / "train_list.txt").write_text("view_001.png\nview_002.png\n")
     refuse(scene, "val_list.txt is missing")
@@ -217,14 +222,15 @@ def test_split_lists(scene):
     (scene / "train_list.txt").write_text("view_001.png\nview_099.png\n")
     refuse(scene, "train_list.txt names views .* view_099.png")
     (scene / "train_list.txt").write_text("")
-    refuse(scene, "0 of 9 views .* to train on .*Edit these files")
+    refuse(scene, "name 0 of 9 views .* to train on.*Edit these files")
 
 
 def test_no_points(scene):
     edit(scene, lambda model: [model.delete_point3D(i) for i in list(model.points3D)])
-    refuse(scene, "has no points.*--load-3D-points False")
-    (warning,) = check(scene, load_3D_points=False).warnings
-    assert "random places" in warning
+    for load in (True, False):
+        summary = check(scene, load_3D_points=load)
+        assert summary.num_points == 0
+        assert "random places" in summary.warnings[0]
 
 
 def test_nerfstudio_fails_without_points_as_we_say(scene):

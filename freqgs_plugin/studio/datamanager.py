@@ -1,0 +1,115 @@
+"""nerfstudio's full-image datamanager, after a look at the scene: what is wrong is said before training starts."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from freqgs_plugin.io.check_images import SceneError, some
+from freqgs_plugin.io.check_scene import SceneSummary, check_colmap_scene, find_model
+
+
+@dataclass
+class SceneDatamanagerConfig(FullImageDatamanagerConfig):
+    """nerfstudio's fields; images are cached as 8 bit."""
+
+    _target: type = field(default_factory=lambda: SceneDatamanager)
+    cache_images_type: Literal["uint8", "float32"] = "uint8"
+
+
+class SceneDatamanager(FullImageDatamanager):
+    """Checks the scene, then reads it as nerfstudio does."""
+
+    config: SceneDatamanagerConfig
+
+    def __init__(
+        self,
+        config: SceneDatamanagerConfig,
+        device: torch.device | str = "cpu",
+        test_mode: Literal["test", "val", "inference"] = "val",
+        world_size: int = 1,
+        local_rank: int = 0,
+        **kwargs: Any,
+    ):
+        parser = config.dataparser
+        data = Path(config.data if config.data is not None else parser.data)
+        if isinstance(parser, ColmapDataParserConfig):
+            _look_at_colmap(parser, data, thorough=test_mode == "val")
+        elif isinstance(parser, NerfstudioDataParserConfig):
+            _look_at_transforms(data)
+        super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
+        _look_at_views(self.train_dataset, data)
+
+
+def _look_at_colmap(parser: ColmapDataParserConfig, data: Path, thorough: bool) -> None:
+    """Point the parser at the model that is there, and check the scene."""
+    found = find_model(data)
+    if found is not None and find_model(data, (str(parser.colmap_path),)) is None:
+        CONSOLE.log(f"No COLMAP model in {data / parser.colmap_path}; using the one in {data / found}.")
+        parser.colmap_path = Path(found)
+    if not thorough:
+        return
+    summary = check_colmap_scene(
+        data,
+        colmap_path=parser.colmap_path,
+        images_path=parser.images_path,
+        downscale_factor=parser.downscale_factor,
+        downscale_rounding_mode=parser.downscale_rounding_mode,
+        eval_mode=parser.eval_mode,
+        eval_interval=parser.eval_interval,
+        train_split_fraction=parser.train_split_fraction,
+        load_3D_points=parser.load_3D_points,
+    )
+    if summary.num_points == 0:
+        parser.load_3D_points = False
+    _report(summary)
+
+
+def _report(summary: SceneSummary) -> None:
+    sizes = ", ".join(f"{w}x{h} px" for w, h in summary.sizes)
+    CONSOLE.log(
+        f"{summary.num_views} views ({summary.num_train} to train on, {summary.num_eval} held out), {sizes}, "
+        f"{summary.num_points:,} points."
+    )
+    for warning in summary.warnings:
+        CONSOLE.log(f"[yellow]{warning}")
+
+
+def _look_at_transforms(data: Path) -> None:
+    if data.suffix == ".json":
+        if not data.is_file():
+            raise SceneError(f"{data} does not exist; name a folder with a transforms.json, or that file.")
+        return
+    if not data.is_dir():
+        raise SceneError(f"the data folder {data} does not exist.")
+    if (data / "transforms.json").is_file():
+        return
+    model = find_model(data)
+    hint = (
+        f"There is a COLMAP model in {data / model}: end the command with `colmap`."
+        if model is not None
+        else "Run `ns-process-data images` on the photographs first, or name another dataparser after the options."
+    )
+    raise SceneError(f"{data} holds no transforms.json. {hint}")
+
+
+def _look_at_views(dataset: Any, data: Path) -> None:
+    """What any dataparser's result must fulfil."""
+    if len(dataset) < 1:
+        raise SceneError(f"the split of {data} leaves no view to train on; hold fewer views out.")
+    missing = [str(f) for f in dataset.image_filenames if not Path(f).is_file()]
+    if missing:
+        raise SceneError(f"{len(missing)} of {len(dataset)} images of {data} are missing: {some(missing)}.")
+    kinds = {int(k) for k in dataset.cameras.camera_type.flatten()} - {CameraType.PERSPECTIVE.value}
+    if kinds:
+        names = ", ".join(t.name for t in CameraType if t.value in kinds)
+        raise SceneError(
+            f"{data} has cameras of type {names}. Gaussians are projected by a pinhole camera: undistort the images first "
+            "(for COLMAP models: `colmap image_undistorter`)."
+        )
