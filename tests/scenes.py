@@ -52,7 +52,7 @@ def leaves_of(scene, dtype):
 
 
 def cast(view, dtype):
-    return Camera(view.viewmat.to(dtype), view.K.to(dtype), view.width, view.height)
+    return Camera(view.viewmat.detach().clone().to(dtype), view.K.to(dtype), view.width, view.height)
 
 
 def awkward():
