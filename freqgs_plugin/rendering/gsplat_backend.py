@@ -5,6 +5,7 @@ larger one is kept, as in 1.4. Newer kernels cap alpha at 0.99 instead of 0.999:
 by up to 0.01 where a single Gaussian is opaque.
 """
 
+import importlib
 from typing import Any
 
 import torch
@@ -97,10 +98,10 @@ def _missing(device: torch.device) -> str | None:
         return f"the package gsplat cannot be imported ({error}); install gsplat==1.4.0"
     remedy = "install the CUDA toolkit of torch's version, or a prebuilt wheel from https://docs.gsplat.studio/whl"
     try:
-        from gsplat.cuda._backend import _C
+        kernels = importlib.import_module("gsplat.cuda._backend")._C
     except Exception as error:  # this import compiles, and a failing compiler raises anything
         return f"gsplat's CUDA kernels cannot be compiled ({type(error).__name__}: {error}); {remedy}"
-    if _C is None:
+    if kernels is None:
         return f"gsplat's CUDA kernels are not compiled and there is no nvcc to compile them; {remedy}"
     return None
 

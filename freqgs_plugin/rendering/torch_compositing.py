@@ -125,7 +125,7 @@ def _alpha(
     if slab.may_cap:
         uncapped = scratch("uncapped", *alpha.shape).copy_(alpha).le_(ALPHA_MAX)
         alpha.clamp_max_(ALPHA_MAX)
-    return torch.nn.functional.threshold_(alpha, ALPHA_MIN, 0.0), uncapped
+    return torch.nn.functional.threshold(alpha, ALPHA_MIN, 0.0, inplace=True), uncapped
 
 
 def _weights(
