@@ -68,9 +68,19 @@ class Solid:
         corner = {"sphere": max(x, y, z), "cylinder": float(np.hypot(max(x, y), z))}
         return corner.get(self.kind, float(np.linalg.norm(self.half)))
 
+    @property
+    def position(self) -> Float[np.ndarray, " 3"]:
+        """The centre as an array."""
+        return np.array(self.centre, np.float32)
+
+    @property
+    def extent(self) -> Float[np.ndarray, " 3"]:
+        """The half-extents as an array."""
+        return np.array(self.half, np.float32)
+
     def to_unit(self, vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """World vectors (not points) in unit coordinates."""
-        return (vectors @ self.rotation) / np.float32(self.half)
+        return (vectors @ self.rotation) / self.extent
 
 
 @dataclass(frozen=True)
@@ -127,7 +137,7 @@ def cast(
             continue
         some = directions if rows is None else directions[rows]
         rows = slice(None) if rows is None else rows
-        t = intersect(item.kind, item.to_unit(origin - np.float32(item.centre)), item.to_unit(some))
+        t = intersect(item.kind, item.to_unit(origin - item.position), item.to_unit(some))
         closer = t < nearest[rows]
         nearest[rows] = np.where(closer, t, nearest[rows])
         index[rows] = np.where(closer, i, index[rows])
@@ -136,7 +146,7 @@ def cast(
 
 def _candidates(item: Solid, origin: Float[np.ndarray, " 3"], directions: Vectors) -> Int[np.ndarray, " m"] | None:
     """Rays inside of the cone around the solid's bounding sphere; None means all."""
-    offset = np.float32(item.centre) - origin
+    offset = item.position - origin
     distance = float(np.linalg.norm(offset))
     if item.kind == "room" or distance <= item.bound:
         return None
@@ -174,12 +184,12 @@ def _material(
     item: Solid, points: Vectors, directions: Vectors, footprint: Float[np.ndarray, " n"]
 ) -> tuple[Vectors, Vectors]:
     """Albedo and unit normal (towards the viewer). `footprint`: distance between neighbouring rays, world."""
-    hits = surface(item.kind, item.to_unit(points - np.float32(item.centre)))
-    normal = (hits.normal / np.float32(item.half)) @ item.rotation.T
+    hits = surface(item.kind, item.to_unit(points - item.position))
+    normal = (hits.normal / item.extent) @ item.rotation.T
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     cosine = -(normal * directions).sum(1)
     normal = np.where(cosine[:, None] < 0, -normal, normal)
-    sizes = face_size(item.kind, np.float32(item.half))
+    sizes = face_size(item.kind, item.extent)
     albedo = np.empty_like(points)
     for face in np.unique(hits.face):
         rows = np.flatnonzero(hits.face == face)
@@ -188,7 +198,7 @@ def _material(
         (u, v), (tu, tv) = sizes[face], look.tiles
         density = np.sqrt(width * tu / u * height * tv / v)
         texels = footprint[rows] * np.float32(density) / np.sqrt(np.maximum(np.abs(cosine[rows]), 0.05))
-        albedo[rows] = look.texture.sample(hits.uv[rows] * np.float32(look.tiles), texels)
+        albedo[rows] = look.texture.sample(hits.uv[rows] * np.array(look.tiles, np.float32), texels)
     return albedo, normal
 
 

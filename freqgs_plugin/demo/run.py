@@ -1,11 +1,11 @@
 """The demo from end to end: write the scene, train lapsplat through nerfstudio, show and measure the levels."""
 
 import time
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from freqgs_plugin.demo.dataset import MANIFEST, SceneOptions, write_scene
 from freqgs_plugin.demo.training import TrainingRun, train
@@ -54,8 +54,7 @@ def run_demo(options: DemoOptions, console: "Console") -> None:
     )
     with _timed(seconds, "training"):
         _train(run, out / "train.log", console)
-    with _timed(seconds, "report"):
-        _report(run, options, seconds, console)
+    _report(run, options, seconds, console)
 
 
 def claim_output(folder: Path) -> None:
@@ -125,12 +124,14 @@ def _train(run: TrainingRun, log: Path, console: "Console") -> None:
 def _report(run: TrainingRun, options: DemoOptions, seconds: dict[str, float], console: "Console") -> None:
     from freqgs_plugin.reports.contact_sheet import contact_sheet
     from freqgs_plugin.reports.tables import prefix_rows, prefix_table, write_report
-    from freqgs_plugin.studio.checkpoint import load_run
 
     out = options.output_dir
     # nerfstudio's remarks on loading belong to the log
-    with (out / "train.log").open("a", encoding="utf-8") as log, redirect_stdout(log):
-        trained = load_run(run.config_path)
+    with (out / "train.log").open("a", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
+        from freqgs_plugin.studio.checkpoint import load_run
+
+        # pyright sees no property in a cached_property
+        trained: Any = load_run(run.config_path)
         views, num_train = trained.cameras("test"), len(trained.cameras("train"))
     shown = sorted({round(i * (len(views) - 1) / (SHEET_VIEWS - 1)) for i in range(SHEET_VIEWS)})
     contact_sheet(out / "contact_sheet.png", trained, [views[i] for i in shown])

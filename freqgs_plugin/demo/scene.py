@@ -125,8 +125,9 @@ def _small_things(seed: int) -> list[Solid]:
     ]  # fmt: skip
     colours = [(0.95, 0.75, 0.1), (0.1, 0.6, 0.3), (0.75, 0.2, 0.6), (0.1, 0.5, 0.8), (0.95, 0.45, 0.1)]
     marbles = [
-        Solid(f"marble {i + 1}", "sphere", (-0.42 + 0.085 * i, -0.68 + 0.04 * np.sin(2.0 * i), z + 0.024), (0.024,) * 3,
-              _plain(checker(colour, (0.97, 0.95, 0.9), 6, 4)), yaw=float(rng.uniform(0, 360)), specular=0.4)
+        Solid(f"marble {i + 1}", "sphere", (-0.42 + 0.085 * i, -0.68 + 0.04 * np.sin(2.0 * i), z + 0.024),
+              (0.024, 0.024, 0.024), _plain(checker(colour, (0.97, 0.95, 0.9), 6, 4)), specular=0.4,
+              yaw=float(rng.uniform(0, 360)))
         for i, colour in enumerate(colours)
     ]  # fmt: skip
     pencils = [

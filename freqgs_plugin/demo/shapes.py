@@ -16,6 +16,7 @@ Vectors = Float[np.ndarray, "n 3"]
 Distances = Float[np.ndarray, " n"]
 Kind = Literal["room", "box", "sphere", "cylinder"]
 
+_Z = np.array((0, 0, 1), np.float32)
 EPSILON = 1e-4
 """hits nearer than this along the ray are ignored"""
 
@@ -107,7 +108,7 @@ def _sphere_surface(point: Vectors) -> Hits:
 def _cylinder_surface(point: Vectors) -> Hits:
     x, y, z = point.T
     cap = np.abs(z) > x * x + y * y
-    normal = np.where(cap[:, None], point * np.float32((0, 0, 1)), point * np.float32((1, 1, 0)))
+    normal = np.where(cap[:, None], point * _Z, point * (1 - _Z))
     u = np.where(cap, (x + 1) / 2, np.arctan2(y, x) / np.float32(2 * np.pi) + np.float32(0.5))
     v = np.where(cap, (1 - y) / 2, (1 - z) / 2)
     return Hits(normal, np.stack([u, v], 1), cap.astype(np.int64))

@@ -45,6 +45,10 @@ class Texture:
         return colours
 
 
+def _rgb(colour: Colour) -> Float[np.ndarray, " 3"]:
+    return np.array(colour, np.float32)
+
+
 def _halve(image: Image) -> Float[np.ndarray, "h2 w2 3"]:
     h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     return image[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3))
@@ -85,7 +89,7 @@ def photo(
     image = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image[..., :3]
     if crop is not None:
         image = image[crop[0] : crop[1], crop[2] : crop[3]]
-    return Texture(np.clip(image * np.float32(tint or (1, 1, 1)), 0, 1).astype(np.float32), repeat)
+    return Texture(np.clip(image * _rgb(tint or (1, 1, 1)), 0, 1).astype(np.float32), repeat)
 
 
 def solid(red: Number, green: Number, blue: Number) -> Texture:
@@ -96,14 +100,14 @@ def solid(red: Number, green: Number, blue: Number) -> Texture:
 def gradient(top: Colour, bottom: Colour) -> Texture:
     """A vertical ramp: the smoothest thing in the scene."""
     ramp = np.linspace(0, 1, 64, dtype=np.float32)[:, None, None]
-    image = np.float32(top) * (1 - ramp) + np.float32(bottom) * ramp
+    image = _rgb(top) * (1 - ramp) + _rgb(bottom) * ramp
     return Texture(np.repeat(image, 64, axis=1))
 
 
 def checker(first: Colour, second: Colour, columns: int, rows: int) -> Texture:
     """A chessboard of `rows` x `columns` fields, 32 texels each."""
     board = (np.add.outer(np.arange(rows * 32) // 32, np.arange(columns * 32) // 32) % 2)[..., None]
-    return Texture(np.where(board == 0, np.float32(first), np.float32(second)).astype(np.float32), repeat=True)
+    return Texture(np.where(board == 0, _rgb(first), _rgb(second)).astype(np.float32), repeat=True)
 
 
 def wood(seed: int, size: int = 512) -> Texture:
@@ -117,4 +121,4 @@ def wood(seed: int, size: int = 512) -> Texture:
     grain = np.repeat(rng.normal(0, 1, (size, size // 16)), 16, axis=1).astype(np.float32)
     shade = 0.78 + 0.16 * rings + 0.05 * grain + 0.08 * np.sin(shift * 5)
     shade = np.where((y * 6 - plank) < 0.02, 0.45, shade)
-    return Texture(np.clip(shade[..., None] * np.float32((0.68, 0.45, 0.26)), 0, 1).astype(np.float32), repeat=True)
+    return Texture(np.clip(shade[..., None] * _rgb((0.68, 0.45, 0.26)), 0, 1).astype(np.float32), repeat=True)

@@ -20,21 +20,30 @@ LEVEL_COLOURS = ((0.90, 0.62, 0.00), (0.34, 0.71, 0.91), (0.00, 0.62, 0.45), (0.
 class TrainedRun(Protocol):
     """What a report needs of a run (`studio.checkpoint.Run` has it)."""
 
-    gaussians: Gaussians
-    background: Tensor
-    rasterizer: Rasterizer
-    num_levels: int
-    antialiased: bool
+    @property
+    def gaussians(self) -> Gaussians: ...
+    @property
+    def background(self) -> Float[Tensor, " 3"]: ...
+    @property
+    def rasterizer(self) -> Rasterizer: ...
+    @property
+    def num_levels(self) -> int: ...
+    @property
+    def antialiased(self) -> bool: ...
 
 
 @runtime_checkable
 class HeldOutView(Protocol):
     """A view with its photograph (`studio.checkpoint.View`)."""
 
-    name: str
-    camera: Camera
-    image: Tensor
-    """[h, w, 3], RGB in [0, 1]"""
+    @property
+    def name(self) -> str: ...
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def image(self) -> Float[Tensor, "h w 3"]:
+        """RGB in [0, 1]."""
+        ...
 
 
 @torch.no_grad()
