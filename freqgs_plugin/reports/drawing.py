@@ -60,7 +60,7 @@ def draw(run: TrainedRun, camera: Camera, attenuation: Attenuation | None = None
     )
 
 
-def prefix(run: TrainedRun, camera: Camera, level: float) -> Float[Tensor, "h w 3"]:
+def prefix(run: TrainedRun, camera: Camera, level: float | int) -> Float[Tensor, "h w 3"]:
     """The picture of all levels <= `level`, not clamped."""
     return draw(run, camera, LevelCut(level)).features
 
