@@ -127,7 +127,7 @@ class _Composite(torch.autograd.Function):
             for name in total:
                 total[name] += out[name]
             v_view += v_view_group
-        if ctx.probe is not None:
+        if ctx.probe is not None and d <= _CHANNELS:
             ctx.probe.absgrad = total["abs"][None]
         v_pose = None
         if ctx.needs_input_grad[6]:
@@ -141,7 +141,11 @@ class _Composite(torch.autograd.Function):
 
 
 class NumbaRasterizer:
-    """Renders float32 tensors on the CPU. Gradients: all of `Splats`, and the camera's view matrix."""
+    """Renders float32 tensors on the CPU. Gradients: all of `Splats`, and the camera's view matrix.
+
+    More than 3 features are composited three at a time. Absolute gradients do not add up over such groups, so
+    `info["means2d"]` has an `absgrad` for up to 3 features only.
+    """
 
     name = "numba"
 
