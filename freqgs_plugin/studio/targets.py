@@ -24,7 +24,7 @@ class ViewTarget:
 class TargetCache:
     """Targets by view, up to a bound on memory."""
 
-    def __init__(self, megabytes: float):
+    def __init__(self, megabytes: float | int):
         self._bound = megabytes
         self._used = 0.0
         self._kept: dict[Hashable, ViewTarget] = {}
