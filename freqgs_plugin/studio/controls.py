@@ -1,4 +1,4 @@
-"""Viewer controls, and what they say about how to draw. They touch pictures in the viewer only, never training or files."""
+"""Viewer controls, and what they say about how to draw. They touch pictures in the viewer only, never training."""
 
 import threading
 import time
@@ -35,9 +35,20 @@ def lod_slider(num_levels: int, redraw: Callable[[Any], None]) -> ViewerSlider:
     )
 
 
+class WrittenText(ViewerText):
+    """Text that only the program writes.
+
+    viser calls the hook of an input whenever its value changes, and nerfstudio hooks a new render to every input: text
+    written by a render would ask for the next one, for ever.
+    """
+
+    def install(self, viser_server: Any) -> None:
+        self._create_gui_handle(viser_server)
+
+
 def drawn_text() -> ViewerText:
     """Read-only text: Gaussians drawn, of how many, and the time it took."""
-    return ViewerText(name="Drawn", default_value="-", disabled=True, hint="Gaussians drawn / all, render time")
+    return WrittenText(name="Drawn", default_value="-", disabled=True, hint="Gaussians drawn / all, render time")
 
 
 def level_cut(slider: ViewerSlider) -> LevelCut:
