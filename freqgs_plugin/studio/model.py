@@ -263,7 +263,9 @@ class FreqSplatModel(SplatfactoModel):
         self._checked = True
         skipped_before = self.guard.skipped
         try:
-            self._step_is_finite = self.guard.check(self.gauss_params, self.level, self.step)  # pyright: ignore
+            # camera poses and bilateral grids too: their optimizers move in the same step
+            parameters = {name.removeprefix("gauss_params."): p for name, p in self.named_parameters()}
+            self._step_is_finite = self.guard.check(parameters, self.level, self.step)  # pyright: ignore
         except NonFiniteError:
             trainer.save_checkpoint(self.step)
             raise
