@@ -27,6 +27,10 @@ class LazyOutputs(dict[str, Any]):
         self._later.pop(name, None)
         super().__setitem__(name, value)
 
+    def __iter__(self) -> Iterator[str]:
+        # without this, dict(outputs) and {**outputs} copy what is stored and skip __getitem__
+        return super().__iter__()
+
     def get(self, name: str, default: Any = None) -> Any:
         return self[name] if name in self else default
 
