@@ -1,8 +1,8 @@
 """Which threads numba runs on. Take `njit` and `prange` from here: importing this chooses the threading layer.
 
 Viewer and training are two threads that render at the same time. numba's `workqueue` layer aborts the process then, and
-`omp` (GNU OpenMP) kills a child that is forked after first use; `tbb` allows both. The `tbb` wheel puts its library where
-the dynamic linker does not look, so numba alone would not find it: it is
+`omp` (GNU OpenMP) kills a child that is forked after first use; `tbb` allows both. The `tbb` wheel puts its library
+where the dynamic linker does not look, so numba alone would not find it: it is
 loaded by path here.
 """
 

@@ -1,6 +1,7 @@
 """The rasterizer seam: protocol, chooser and the compositing constants that every backend shares.
 
-The constants are those of gsplat 1.4.0's CUDA kernels, so that a scene trained with one backend looks the same with another.
+The constants are those of gsplat 1.4.0's CUDA kernels, so that a scene trained with one backend looks the same with
+another.
 """
 
 import importlib
@@ -66,9 +67,10 @@ class Rasterizer(Protocol):
             depth: also composite the expected depth; `Rendering.depth` is zero where this is False.
 
         Returns:
-            features [h, w, d], alpha and expected depth [h, w, 1], and `info` with gsplat's keys: `means2d` [1, n, 2] px
-            (after backward with `.grad`, and `.absgrad` where the backend has `absgrad`), `radii` [1, n] px (0: not
-            drawn), `depths`, `conics`, `opacities` [1, n], `width`, `height`, `n_cameras`, `gaussian_ids`, `camera_ids`.
+            features [h, w, d], alpha and expected depth [h, w, 1], and `info` with gsplat's keys: `means2d` [1, n, 2]
+            px (after backward with `.grad`, and `.absgrad` where the backend has `absgrad`), `radii` [1, n] px (0: not
+            drawn), `depths`, `conics`, `opacities` [1, n], `width`, `height`, `n_cameras`, `gaussian_ids`,
+            `camera_ids`.
         """
         ...
 
@@ -91,7 +93,8 @@ class PrefixRasterizer(Rasterizer, Protocol):
     ) -> list[Rendering]:
         """One rendering per prefix k = 1..num_levels of all splats with `level <= k`, without depth.
 
-        The last rendering's `info` describes all n splats; its `means2d` receives the gradients that `statistics` names.
+        The last rendering's `info` describes all n splats; its `means2d` receives the gradients that `statistics`
+        names.
         """
         ...
 
@@ -132,7 +135,8 @@ def get_rasterizer(name: str, device: torch.device | str, *, absgrad: bool = Tru
         )
     if name == "numba" and kind != "cpu":
         raise ValueError(
-            f"rasterizer 'numba' runs on the CPU only, but the tensors are on '{kind}'. Choose: auto, {', '.join(fitting)}."
+            f"rasterizer 'numba' runs on the CPU only, but the tensors are on '{kind}'. "
+            f"Choose: auto, {', '.join(fitting)}."
         )
     if name in _BUILT_IN:
         module, attribute = _BUILT_IN[name]

@@ -1,8 +1,9 @@
 """Compiled front-to-back compositing of tile lists, and its gradient; all level prefixes in one pass.
 
 Every tile keeps one block of scratch per prefix. The first prefix that a Gaussian belongs to computes its alpha; each
-block hands alpha on to the next, so one exponential serves them all. Blocks have compile-time strides: that is what lets
-LLVM see that reads and writes do not overlap, and vectorise. A finished pixel has its transmittance stored negative.
+block hands alpha on to the next, so one exponential serves them all. Blocks have compile-time strides: that is what
+lets LLVM see that reads and writes do not overlap, and vectorise. A finished pixel has its transmittance stored
+negative.
 
 Pixels of a tile are ordered by strips of STRIP columns, then rows, so that a small Gaussian touches few of them and any
 box of rows in a strip is contiguous.
@@ -285,7 +286,7 @@ def _backward_next(block, n, c0, c1, c2, stat):
 
 @njit(fastmath=_FAST, error_model="numpy", cache=True)
 def _moments(block, n, gx, gy, ha, b, hc):
-    """Sums over pixels of alpha dL/dalpha times 1, d, d d^T; the same for the statistic's own part, and its absolutes."""
+    """Sums over pixels of alpha dL/dalpha times 1, d, d d^T; times d also for the statistic's part, and absolutes."""
     s = sx = sy = sxx = sxy = syy = tx = ty = ax = ay = _ZERO
     a2, c2 = _TWO * ha, _TWO * hc
     for i in range(n):

@@ -12,8 +12,8 @@ import numpy as np
 from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.rendering.base import ALPHA_MIN, FOV_MARGIN, NEAR_PLANE, RADIUS_SIGMAS
 
-# columns of a projected Gaussian: centre (px), conic / 2 on the diagonal, opacity after compensation, and the half-width
-# and half-height (px) of the ellipse on which alpha >= ALPHA_MIN
+# columns of a projected Gaussian: centre (px), conic / 2 on the diagonal, opacity after compensation, and the
+# half-width and half-height (px) of the ellipse on which alpha >= ALPHA_MIN
 X, Y, HALF_A, B, HALF_C, OPACITY, REACH_X, REACH_Y = range(8)
 COLUMNS = 8
 
@@ -262,8 +262,8 @@ def project_backward(
 ):  # fmt: skip
     """Sum each Gaussian's rows of `partial` [slots, V_COLUMNS] and carry them back to its parameters.
 
-    `first` and `count` [n] name a Gaussian's rows. `v_view` [n, 12] receives each Gaussian's share of the gradient of the
-    world-to-camera matrix (rows of R, then t) unless it has no rows.
+    `first` and `count` [n] name a Gaussian's rows. `v_view` [n, 12] receives each Gaussian's share of the gradient of
+    the world-to-camera matrix (rows of R, then t) unless it has no rows.
     """
     for i in prange(means.shape[0]):
         if count[i] > 0:

@@ -110,6 +110,6 @@ def _look_at_views(dataset: Any, data: Path) -> None:
     if kinds:
         names = ", ".join(t.name for t in CameraType if t.value in kinds)
         raise SceneError(
-            f"{data} has cameras of type {names}. Gaussians are projected by a pinhole camera: undistort the images first "
-            "(for COLMAP models: `colmap image_undistorter`)."
+            f"{data} has cameras of type {names}. Gaussians are projected by a pinhole camera: undistort the images "
+            "first (for COLMAP models: `colmap image_undistorter`)."
         )

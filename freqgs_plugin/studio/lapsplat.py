@@ -41,7 +41,7 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     stop_split_at: int = 30_000
     """densification ends at this step (the paper: never)"""
     signed_residuals: bool = True
-    """levels above 1 hold colours in [-1, inf) (Eq. 4); off: [0, inf) for all, more Gaussians, but exports as a plain PLY"""
+    """levels above 1 hold colours in [-1, inf) (Eq. 4); off: [0, inf) for all, which exports as a plain PLY"""
     image_weight: float = 1.0
     """weight of the image term (Eq. 13, the paper)"""
     dft_weight: float = 1e-3
@@ -51,9 +51,11 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     lower_level_weight: float = 0.1
     """lambda_k of the image term for prefixes k < m (Eq. 12, the paper); 0 leaves them out"""
     clamp_in_loss: Literal["none", "hard", "straight_through"] = "none"
-    """clamp pictures to [0, 1] before the loss: the paper's code does, hard, which stops gradients outside (ours: none)"""
+    """clamp pictures to [0, 1] before the loss: hard (the paper's code) stops gradients outside of it (ours: none)"""
     growth: Growth = "all"
     """which Gaussians may grow: all (the paper), newest level only, or each level from its own_prefix (ours)"""
+    coarse_growth_factor: float = 1.0
+    """densification threshold is multiplied by this for each level below the finest (1: the paper)"""
     lower_cull_alpha_thresh: float = 0.1
     """opacity under which Gaussians of levels below the newest are pruned (the paper: as the newest)"""
     reset_levels: Literal["all", "newest"] = "all"
@@ -81,8 +83,8 @@ class LapSplatModel(FreqSplatModel):
         strategy = getattr(config, "strategy", "default")
         if strategy != "default":
             raise ValueError(
-                f"strategy '{strategy}' does not work with lapsplat: MCMC moves Gaussians between places and overwrites "
-                "the state in which level tags travel. Use the default strategy."
+                f"strategy '{strategy}' does not work with lapsplat: MCMC moves Gaussians between places and "
+                "overwrites the state in which level tags travel. Use the default strategy."
             )
 
     def populate_modules(self) -> None:
@@ -102,6 +104,14 @@ class LapSplatModel(FreqSplatModel):
     def num_levels(self) -> int:
         """Levels present now."""
         return self._stage
+
+    def _adapt_to_images(self, height: int, width: int) -> None:
+        self._num_levels = min(self.config.num_levels, max_levels(height, width))
+        if self._num_levels < self.config.num_levels:
+            CONSOLE.log(
+                f"[yellow]{self._num_levels} levels instead of {self.config.num_levels}: "
+                f"with more, images of {width}x{height} px would be trained at under 16 px."
+            )
 
     def _set_up_schedule(self) -> None:
         config, s = self.config, self._scale
@@ -170,17 +180,24 @@ class LapSplatModel(FreqSplatModel):
         return _LentLevels(self)
 
     def _densify(self, step: int) -> None:
-        weight = None
-        if self.config.growth == "own_prefix" and self._stage > 1 and self.config.lower_level_weight > 0:
-            weight = torch.where(self.level < self._stage, self.config.lower_level_weight, 1.0)  # pyright: ignore
         assert self._info is not None
-        self.strategy.observe(self.strategy_state, self._info, weight)
+        self.strategy.observe(self.strategy_state, self._info, self._gradient_weights())
         with self._lent_levels() as state:
             done = self.strategy.step(self.gauss_params, self._optimizers.optimizers, state, step, self.schedule)
         if done:
             what = ", ".join(f"{count:,} {name}" for name, count in done.items())
             levels = " / ".join(f"{c:,}" for c in self.level_counts())
             CONSOLE.log(f"Step {step}: {what}; now {self.num_points:,} Gaussians, by level {levels}.")
+
+    def _gradient_weights(self) -> Float[Tensor, " n"]:
+        """What each Gaussian's 2D gradient is divided by before it is compared with the densification threshold."""
+        config = self.config
+        level: Tensor = self.level  # pyright: ignore[reportAssignmentType]
+        weight = config.coarse_growth_factor ** (self._num_levels - level).float()
+        if config.growth == "own_prefix" and config.lower_level_weight > 0:
+            # free the gradient from the loss weight of its prefix
+            weight = torch.where(level < self._stage, weight * config.lower_level_weight, weight)
+        return weight
 
     def level_counts(self) -> list[int]:
         """Gaussians of each level, 1..L so far."""
@@ -346,8 +363,8 @@ class LapSplatModel(FreqSplatModel):
     def _refuse_export(self) -> None:
         if self.config.signed_residuals and self._stage > 1:
             raise ValueError(
-                f"this scene has {self._stage} levels with signed residual colours (in [-1, inf)). A 3DGS PLY cannot hold "
-                "them: viewers clamp each Gaussian's colour at 0, and the picture would be wrong. Train with "
+                f"this scene has {self._stage} levels with signed residual colours (in [-1, inf)). A 3DGS PLY cannot "
+                "hold them: viewers clamp each Gaussian's colour at 0, and the picture would be wrong. Train with "
                 "`--pipeline.model.signed-residuals False` to export a scene of several levels."
             )
 
@@ -365,8 +382,3 @@ class _LentLevels:
 
     def __exit__(self, *_: object) -> None:
         self._model.level = self._model.strategy_state.pop("level")
-
-
-def supported_levels(height: int, width: int, wanted: int) -> int:
-    """`wanted` levels, or as many as keep the coarsest training image at 16 px or more."""
-    return min(wanted, max_levels(height, width))

@@ -12,7 +12,7 @@ _WEIGHTS = "alexnet-owt-7be5be79.pth"
 
 @lru_cache(maxsize=2)
 def lpips_if_available(device: torch.device) -> Any | None:
-    """LPIPS with AlexNet on images in [0, 1], or None (said once) where torchvision's AlexNet is not in torch's cache."""
+    """LPIPS with AlexNet on images in [0, 1], or None (said once) where its weights are not in torch's cache."""
     path = Path(torch.hub.get_dir()) / "checkpoints" / _WEIGHTS
     if not path.exists():
         CONSOLE.log(

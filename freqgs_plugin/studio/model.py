@@ -233,6 +233,8 @@ class FreqSplatModel(SplatfactoModel):
         if not resumed:
             steps = trainer.config.max_num_iterations
             self._scale = self.config.steps_scale or steps / REFERENCE_STEPS
+            cameras = attributes.pipeline.datamanager.train_dataset.cameras
+            self._adapt_to_images(int(cameras.height.min()), int(cameras.width.min()))
         self._set_up_schedule()
         CONSOLE.log(f"Step constants are multiplied by {self._scale:g}.")
         adopt_parameters(optimizers, self.get_param_groups())
@@ -245,6 +247,9 @@ class FreqSplatModel(SplatfactoModel):
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self._before_step),
             TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._after_step),
         ]
+
+    def _adapt_to_images(self, height: int, width: int) -> None:
+        """Before a new run: the smallest training image has this size, px."""
 
     def _set_up_schedule(self) -> None:
         """Build the schedule of this run, `_scale` being known."""

@@ -36,7 +36,7 @@ class TargetCache:
     def get(
         self, key: Hashable | None, make: Callable[[], tuple[Tensor, Tensor | None]], levels: int, dft: bool
     ) -> ViewTarget:
-        """The target under `key`, made by `make` (image [h, w, 3], mask [h, w, 1]) if it is not there; None: not kept."""
+        """The target under `key`, or made by `make` (image [h, w, 3], mask [h, w, 1]); `key` None: not kept."""
         if key is not None and key in self._kept:
             return self._kept[key]
         image, mask = make()

@@ -1,7 +1,7 @@
 """Densification with level tags: gsplat's strategy and operators, told which level may grow and which are pruned.
 
-Levels are an integer tensor, not a parameter: gsplat's operators copy tensors of the strategy's state along with the rows
-that they duplicate, split or remove, so the tags travel there.
+Levels are an integer tensor, not a parameter: gsplat's operators copy tensors of the strategy's state along with the
+rows that they duplicate, split or remove, so the tags travel there.
 """
 
 from collections.abc import Mapping
@@ -33,12 +33,12 @@ class LevelStrategy(DefaultStrategy):
     max_gaussians: int = 0
     """refinement adds none once there are this many; 0: no bound"""
 
-    def observe(self, state: dict[str, Any], info: dict[str, Any], level_weight: Tensor | None) -> None:
-        """Collect one step's 2D gradients; `level_weight` [n]: loss weights that they are freed from."""
+    def observe(self, state: dict[str, Any], info: dict[str, Any], weight: Tensor | None) -> None:
+        """Collect one step's 2D gradients, divided by `weight` [n]."""
         grads = info["means2d"].absgrad if self.absgrad else info["means2d"].grad
         grads = grads.clone()
-        if level_weight is not None:
-            grads /= level_weight[None, :, None]
+        if weight is not None:
+            grads /= weight[None, :, None]
         seen = info["radii"][0] > 0
         size = grads.new_tensor([info["width"], info["height"]])
         norm = (grads[0] * size / 2.0).norm(dim=-1)

@@ -1,4 +1,4 @@
-"""When things happen in a training run. Step constants are written for REFERENCE_STEPS and scale with the run's length."""
+"""When things happen in a training run. Step constants are for REFERENCE_STEPS and scale with the run's length."""
 
 from dataclasses import dataclass
 

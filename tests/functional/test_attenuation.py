@@ -12,9 +12,7 @@ CAMERA = Camera(torch.eye(4), torch.eye(3), 4, 4)
 
 def gaussians():
     n = len(LEVELS)
-    return Gaussians(
-        torch.zeros(n, 3), torch.ones(n, 4), torch.ones(n, 3), torch.ones(n), torch.zeros(n, 1, 3), LEVELS
-    )
+    return Gaussians(torch.zeros(n, 3), torch.ones(n, 4), torch.ones(n, 3), torch.ones(n), torch.zeros(n, 1, 3), LEVELS)
 
 
 @pytest.mark.parametrize("k", range(7))

@@ -64,5 +64,5 @@ def test_colours_of_levels():
 
 
 def test_bad_degree_is_named():
-    with pytest.raises(ValueError, match="degree 5 is outside of 0..4"):
+    with pytest.raises(ValueError, match=r"degree 5 is outside of 0\.\.4"):
         num_coefficients(5)

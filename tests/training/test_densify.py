@@ -35,7 +35,12 @@ def info(grads, width=100, height=50):
     grads = torch.tensor(grads)[None]
     means2d = torch.zeros_like(grads)
     means2d.absgrad = grads
-    return {"means2d": means2d, "radii": torch.ones(grads.shape[:2], dtype=torch.int32), "width": width, "height": height}
+    return {
+        "means2d": means2d,
+        "radii": torch.ones(grads.shape[:2], dtype=torch.int32),
+        "width": width,
+        "height": height,
+    }
 
 
 def strategy(**changes):
@@ -137,7 +142,9 @@ def test_adding_a_level_duplicates_everything_and_restarts_optimizers():
 def test_a_new_level_may_start_faint():
     params, optimizers, state = scene([1, 1])
     add_level(params, optimizers, state, 2, opacity=0.1)
-    torch.testing.assert_close(torch.sigmoid(params["opacities"][:, 0]), torch.tensor([0.5, 0.5, 0.1, 0.1]), atol=0.01, rtol=0)
+    torch.testing.assert_close(
+        torch.sigmoid(params["opacities"][:, 0]), torch.tensor([0.5, 0.5, 0.1, 0.1]), atol=0.01, rtol=0
+    )
 
 
 def test_level_prune_and_reset_on_one_step():

@@ -35,6 +35,8 @@ def test_sh_degree_grows_to_its_maximum():
     assert [schedule().sh_degree(step, 3) for step in (0, 99, 100, 250, 2000)] == [0, 0, 1, 2, 3]
 
 
-@pytest.mark.parametrize(("steps", "scale", "least", "expected"), [(2500, 0.1, 1, 250), (100, 0.1, 50, 50), (5, 0.01, 1, 1)])
+@pytest.mark.parametrize(
+    ("steps", "scale", "least", "expected"), [(2500, 0.1, 1, 250), (100, 0.1, 50, 50), (5, 0.01, 1, 1)]
+)
 def test_scaled(steps, scale, least, expected):
     assert scaled(steps, scale, least) == expected
