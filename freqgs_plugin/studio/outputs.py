@@ -17,10 +17,9 @@ class LazyOutputs(dict[str, Any]):
         self._later = dict(later)
 
     def __getitem__(self, name: str) -> Any:
-        make = self._later.pop(name, None)
-        if make is not None:
+        if name in self._later:
             with torch.no_grad():
-                self[name] = make()
+                self[name] = self._later[name]()
         return super().__getitem__(name)
 
     def __setitem__(self, name: str, value: Any) -> None:
