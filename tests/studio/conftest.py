@@ -1,0 +1,98 @@
+"""A small scene, a run that the real `ns-train` made of it, and trainers to be stepped by hand."""
+
+import copy
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from running import EVERY, SCALE, SIZE, STEPS, command, train_arguments
+
+from freqgs_plugin.demo.dataset import SceneOptions, write_scene
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory):
+    """Nine views, of which three are held out; nobody writes into it."""
+    folder = tmp_path_factory.mktemp("scene") / "scene"
+    write_scene(
+        folder, SceneOptions(num_views=9, width=SIZE[0], height=SIZE[1], num_points=300, samples=1), progress=False
+    )
+    return folder
+
+
+@pytest.fixture
+def own_scene(scene, tmp_path):
+    """A copy to spoil."""
+    return Path(shutil.copytree(scene, tmp_path / "scene"))
+
+
+@pytest.fixture(scope="session")
+def trained(scene, tmp_path_factory):
+    """config.yml of a finished run of three levels, with the checkpoints of every stage."""
+    output = tmp_path_factory.mktemp("runs")
+    done = command(
+        "ns-train",
+        *train_arguments(
+            scene, output, "--max-num-iterations", STEPS, "--steps-per-save", 25, "--save-only-latest-checkpoint", False
+        ),
+    )
+    config = output / "small" / "lapsplat" / "run" / "config.yml"
+    assert done.code == 0 and config.is_file(), str(done)
+    (config.parent / "log.txt").write_text(done.text)
+    return config
+
+
+@pytest.fixture
+def said(monkeypatch):
+    """What is logged through nerfstudio's console, unwrapped."""
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    lines = []
+    monkeypatch.setattr(CONSOLE, "log", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
+    return lines
+
+
+@pytest.fixture
+def make_config(scene, tmp_path):
+    """`make_config(data=scene, parser={}, **model)`: the registered method's configuration for the small scene."""
+
+    def make(data=None, parser=None, camera_optimizer=None, **model):
+        from nerfstudio.configs.method_configs import all_methods
+        from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+
+        config = copy.deepcopy(all_methods["lapsplat"])
+        manager = config.pipeline.datamanager
+        manager.dataparser = ColmapDataParserConfig(**{"eval_mode": "interval", "eval_interval": 4, **(parser or {})})
+        config.data = manager.data = data or scene
+        config.output_dir, config.experiment_name, config.timestamp = tmp_path / "runs", "small", "now"
+        config.max_num_iterations, config.vis = STEPS, "tensorboard"
+        config.machine.device_type = "cpu"
+        if camera_optimizer:
+            config.pipeline.model.camera_optimizer.mode = camera_optimizer
+        for name, value in {"steps_scale": SCALE, "least_refine_interval": EVERY, **model}.items():
+            assert hasattr(config.pipeline.model, name), name
+            setattr(config.pipeline.model, name, value)
+        return config
+
+    return make
+
+
+@pytest.fixture
+def make_trainer(make_config, monkeypatch):
+    """`make_trainer(load_dir=None, ...)`: nerfstudio's own Trainer, set up and ready to step."""
+    from nerfstudio.utils import writer
+
+    monkeypatch.setattr(writer, "EVENT_WRITERS", [])
+
+    def make(load_dir=None, load_step=None, edit=lambda config: None, **settings):
+        config = make_config(**settings)
+        config.load_dir, config.load_step = load_dir, load_step
+        edit(config)
+        torch.manual_seed(0)
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        return trainer
+
+    yield make
+    writer.EVENT_STORAGE.clear()

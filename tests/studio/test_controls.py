@@ -1,0 +1,146 @@
+"""What the viewer's controls change, and what they must leave alone."""
+
+import threading
+
+import pytest
+import torch
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerElement
+from running import advance
+
+from freqgs_plugin.studio.controls import Stopwatch, in_viewer, level_cut, lod_slider
+
+
+class RenderThread(RenderStateMachine):
+    """One of the viewer's render threads, with something else to do."""
+
+    def __init__(self, work):
+        threading.Thread.__init__(self)
+        self._work = work
+
+    def run(self):
+        self.result = self._work()
+
+
+def in_render_thread(work):
+    thread = RenderThread(work)
+    thread.start()
+    thread.join()
+    return thread.result
+
+
+@pytest.fixture
+def trainer(make_trainer):
+    trainer = make_trainer()
+    advance(trainer, 108)
+    return trainer
+
+
+def view(trainer):
+    """The eval camera and its batch."""
+    trainer.pipeline.eval()
+    return trainer.pipeline.datamanager.fixed_indices_eval_dataloader[0]
+
+
+def test_where_we_are():
+    assert not in_viewer()
+    assert in_render_thread(in_viewer)
+    plain = []
+    thread = threading.Thread(target=lambda: plain.append(in_viewer()))
+    thread.start()
+    thread.join()
+    assert plain == [False]
+
+
+@pytest.mark.slow
+def test_the_slider_acts_in_the_viewer_alone(trainer):
+    model = trainer.pipeline.model
+    camera, batch = view(trainer)
+    with torch.no_grad():
+        before = model.get_outputs_for_camera(camera)["rgb"]
+        model.lod.value = 1.0
+        after = model.get_outputs_for_camera(camera)
+        assert torch.equal(after["rgb"], before)
+        metrics, _ = model.get_image_metrics_and_images(after, batch)
+        assert metrics["gaussians"] == model.num_points
+        assert model.drawn.value == "-"
+
+        shown = in_render_thread(lambda: model.get_outputs_for_camera(camera)["rgb"])
+        assert torch.equal(shown, after["prefix_1"])
+        assert not torch.equal(shown, before)
+        base, everything = model.level_counts()[0], model.num_points
+        assert model.drawn.value.startswith(f"{base:,} / {everything:,}, ") and model.drawn.value.endswith(" ms")
+
+        model.lod.value = 3.0
+        assert torch.equal(in_render_thread(lambda: model.get_outputs_for_camera(camera)["rgb"]), before)
+        assert model.drawn.value.startswith(f"{everything:,} / {everything:,}, ")
+
+        model.lod.value = 2.5
+        between = in_render_thread(lambda: model.get_outputs_for_camera(camera)["rgb"])
+        assert not torch.equal(between, before) and not torch.equal(between, after["prefix_2"])
+
+
+@pytest.mark.slow
+def test_training_does_not_see_the_slider(trainer):
+    model = trainer.pipeline.model
+    camera, _ = trainer.pipeline.datamanager.next_train(0)
+    trainer.pipeline.train()
+    pictures = []
+    for value in (3.0, 1.0):
+        model.lod.value = value
+        torch.manual_seed(0)
+        pictures.append([p.detach() for p in model.get_outputs(camera)["prefixes"]])
+    assert len(pictures[0]) == 3
+    assert all(map(torch.equal, *pictures))
+
+
+def test_the_viewer_finds_the_controls_without_side_effects(trainer):
+    """It reads every public attribute of the model; none may raise, even where the export is refused."""
+    found = parse_object(trainer.pipeline, ViewerElement, "Custom Elements")
+    assert {element.name for _, element in found} == {"Level of detail", "Drawn"}
+    assert all(path.count("/") == 2 for path, _ in found)
+
+
+class Server:
+    """As much of viser as an element needs."""
+
+    def __init__(self):
+        self.gui = self
+        self.hooks = []
+        self.value = None
+
+    def add_text(self, name, value, *_, **__):
+        self.value = value
+        return self
+
+    add_slider = add_text
+
+    def on_update(self, hook):
+        self.hooks.append(hook)
+
+
+def test_writing_the_count_asks_for_no_new_picture(trainer):
+    """viser calls an input's hooks when the program writes it, and nerfstudio's hook renders."""
+    server = Server()
+    trainer.pipeline.model.drawn.install(server)
+    assert server.hooks == []
+    trainer.pipeline.model.drawn.value = "5 / 5, 1 ms"
+    assert server.value == "5 / 5, 1 ms"
+    trainer.pipeline.model.lod.install(server)
+    assert len(server.hooks) == 1
+
+
+def test_slider_and_cut():
+    slider = lod_slider(3, lambda _: None)
+    assert (slider.min, slider.max, slider.value) == (1.0, 3.0, 3.0)
+    slider.value = 1.25
+    assert level_cut(slider).level == 1.25
+    single = lod_slider(1, lambda _: None)
+    assert single.disabled and single.min < single.max
+
+
+def test_stopwatch():
+    with Stopwatch(torch.device("cpu")) as watch:
+        threading.Event().wait(0.02)
+    assert 19 < watch.milliseconds < 2000
