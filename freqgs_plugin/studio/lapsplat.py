@@ -231,14 +231,15 @@ class LapSplatModel(FreqSplatModel):
         }
 
     def _halve(self, image: Tensor) -> Tensor:
-        """Image [h, w, c] at the size of this stage: means of 2^n x 2^n blocks, as splatfacto's."""
+        """Image [h, w, c] at the size of this stage, at least 1 px: means of 2^n x 2^n blocks, as splatfacto's."""
         n = self._halvings()
         if image.dtype == torch.uint8:
             image = image.float() / 255.0
         image = image.to(self.device)
         if n == 0 or not self.training:
             return image
-        return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1)[None], 2**n)[0].permute(1, 2, 0).contiguous()
+        block = [min(2**n, side) for side in image.shape[:2]]
+        return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1)[None], block)[0].permute(1, 2, 0).contiguous()
 
     def _training_targets(self, batch: dict[str, Any], background: Tensor) -> Any:
         image = batch["image"]
