@@ -1,9 +1,8 @@
-"""Which threads numba runs on. Take `njit` and `prange` from here: importing this chooses the threading layer.
+"""Compiled kernels and the threads that they run on. Take `njit` and `prange` from here: importing this chooses both.
 
 Viewer and training are two threads that render at the same time. numba's `workqueue` layer aborts the process then, and
 `omp` (GNU OpenMP) kills a child that is forked after first use; `tbb` allows both. The `tbb` wheel puts its library
-where the dynamic linker does not look, so numba alone would not find it: it is
-loaded by path here.
+where the dynamic linker does not look, so numba alone would not find it: it is loaded by path here.
 """
 
 import ctypes
@@ -15,6 +14,8 @@ from typing import Any
 
 import numba
 from numba import prange
+from numba.core import event
+from rich.console import Console
 
 __all__ = ["check_layer", "njit", "prange"]
 
@@ -24,6 +25,24 @@ _LIBRARIES = ("libtbb.so.12", "libtbb.12.dylib", "tbb12.dll")
 def njit(**options: Any) -> Callable[[Any], Any]:
     """numba's `njit`, without the wrapper that the tests' run-time type checker puts round every function."""
     return lambda function: numba.njit(**options)(inspect.unwrap(function))
+
+
+class _Announcement(event.Listener):
+    """Says once per process that kernels are being compiled: the first run on a machine would seem to hang."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: Any) -> None:
+        module = event.data["dispatcher"].py_func.__module__
+        if not self._said and module.startswith("freqgs_plugin."):
+            self._said = True
+            Console(stderr=True).print(
+                "Compiling CPU kernels: half a minute, once. Later starts load them from numba's cache."
+            )
+
+    def on_end(self, event: Any) -> None:
+        """Nothing: each kernel ends by itself, and training's own output follows."""
 
 
 def _load_tbb() -> bool:
@@ -63,3 +82,4 @@ def check_layer() -> str:
 
 
 _choose_layer()
+event.register("numba:compile", _Announcement())

@@ -5,13 +5,11 @@ bits, with any number of threads: no two threads ever add to the same number.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from numba import get_num_threads
-from rich.console import Console
 from torch import Tensor
 
 from freqgs_plugin.functional.numba_threads import check_layer
@@ -243,16 +241,11 @@ _warm = False
 
 
 def warm_up() -> None:
-    """Compile the kernels or load them from numba's cache, once per process; says so where it compiles."""
+    """Compile the kernels or load them from numba's cache, and check what they run on; once per process."""
     global _warm
     if _warm:
         return
     _warm = True
-    cache = Path(composite_backward._cache.cache_path)  # pyright: ignore[reportFunctionMemberAccess]
-    cached = any(cache.glob("numba_compositing.composite_backward*.nbc"))
-    console = Console(stderr=True)
-    if not cached:
-        console.print("Compiling the CPU rasterizer (once, about 20 seconds; later starts load it from a cache) ...")
     try:
         _render_speck()
     except ValueError as error:
@@ -260,9 +253,7 @@ def warm_up() -> None:
             "numba found no thread-safe threading layer, which two threads that render (training and viewer) need. "
             "Install it with `pip install tbb`, or use --pipeline.model.rasterizer torch."
         ) from error
-    layer = check_layer()
-    if not cached:
-        console.print(f"... compiled. {get_num_threads()} threads, threading layer '{layer}'.")
+    check_layer()
 
 
 def _render_speck() -> None:
