@@ -20,11 +20,11 @@ def basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]
     """Basis functions at unit `directions` (camera to Gaussian, world axes), k = (degree + 1)^2."""
     num_coefficients(degree)
     x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
     out = [torch.full_like(x, C0)]
     if degree > 0:
         out += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if degree > 1:
-        xx, yy, zz = x * x, y * y, z * z
         out += [
             1.0925484305920792 * x * y,
             -1.0925484305920792 * y * z,

@@ -13,7 +13,6 @@ from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel, SplatfactoMode
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
 from torch import Tensor
-from torchmetrics.image import PeakSignalNoiseRatio
 
 from freqgs_plugin.functional.attenuation import Attenuation
 from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
@@ -92,6 +91,8 @@ class FreqSplatModel(SplatfactoModel):
         if self.config.use_bilateral_grid:
             x, y, w = self.config.grid_shape
             self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
+        from torchmetrics.image import PeakSignalNoiseRatio
+
         self.psnr = PeakSignalNoiseRatio(data_range=1.0)
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         random = self.config.background_color == "random"
@@ -233,7 +234,8 @@ class FreqSplatModel(SplatfactoModel):
         if not resumed:
             steps = trainer.config.max_num_iterations
             self._scale = self.config.steps_scale or steps / REFERENCE_STEPS
-            cameras = attributes.pipeline.datamanager.train_dataset.cameras
+            assert attributes.pipeline is not None
+            cameras = attributes.pipeline.datamanager.train_dataset.cameras  # pyright: ignore
             self._adapt_to_images(int(cameras.height.min()), int(cameras.width.min()))
         self._set_up_schedule()
         CONSOLE.log(f"Step constants are multiplied by {self._scale:g}.")

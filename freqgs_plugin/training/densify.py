@@ -4,7 +4,6 @@ Levels are an integer tensor, not a parameter: gsplat's operators copy tensors o
 rows that they duplicate, split or remove, so the tags travel there.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,7 +15,6 @@ from torch import Tensor
 from freqgs_plugin.training.schedule import Schedule
 
 Growth = Literal["all", "newest", "own_prefix"]
-Optimizers = Mapping[str, torch.optim.Optimizer]
 
 
 @dataclass
@@ -53,7 +51,7 @@ class LevelStrategy(DefaultStrategy):
     def step(
         self,
         params: Any,
-        optimizers: Optimizers,
+        optimizers: Any,
         state: dict[str, Any],
         step: int,
         schedule: Schedule,
@@ -70,7 +68,7 @@ class LevelStrategy(DefaultStrategy):
             done["reset"] = self._reset(params, optimizers, state, stage)
         return done
 
-    def _grow(self, params, optimizers: Optimizers, state: dict[str, Any], step: int, stage: int) -> tuple[int, int]:
+    def _grow(self, params, optimizers: Any, state: dict[str, Any], step: int, stage: int) -> tuple[int, int]:
         if self.max_gaussians and len(params["means"]) >= self.max_gaussians:
             return 0, 0
         if self.growth == "newest":
@@ -80,7 +78,7 @@ class LevelStrategy(DefaultStrategy):
         return self._grow_gs(params, optimizers, state, step)
 
     @torch.no_grad()
-    def _prune(self, params, optimizers: Optimizers, state: dict[str, Any], step: int, stage: int) -> int:
+    def _prune(self, params, optimizers: Any, state: dict[str, Any], step: int, stage: int) -> int:
         opacity = torch.sigmoid(params["opacities"].flatten())
         threshold = torch.where(state["level"] < stage, self.lower_prune_opa, self.prune_opa)
         prune = opacity < threshold
@@ -99,7 +97,7 @@ class LevelStrategy(DefaultStrategy):
         return int(prune.sum())
 
     @torch.no_grad()
-    def _reset(self, params, optimizers: Optimizers, state: dict[str, Any], stage: int) -> int:
+    def _reset(self, params, optimizers: Any, state: dict[str, Any], stage: int) -> int:
         """Clamp opacities to twice the prune threshold, and forget their optimizer's state, as `reset_opa` does."""
         rows = torch.ones_like(state["level"], dtype=torch.bool)
         if self.reset_levels == "newest":
@@ -113,7 +111,7 @@ class LevelStrategy(DefaultStrategy):
         return int(rows.sum())
 
 
-def add_level(params, optimizers: Optimizers, state: dict[str, Any], level: int, opacity: float | None = None) -> int:
+def add_level(params, optimizers: Any, state: dict[str, Any], level: int, opacity: float | None = None) -> int:
     """Duplicate every Gaussian that is not of `level` with that level (Section 3.2); optimizers start afresh.
 
     Args:

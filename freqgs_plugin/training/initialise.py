@@ -2,7 +2,7 @@
 
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from freqgs_plugin.functional.harmonics import C0, num_coefficients
@@ -19,7 +19,7 @@ def neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     if len(points) < 2:
         return torch.ones(len(points))
     neighbours = min(_NEIGHBOURS, len(points) - 1)
-    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=neighbours + 1)
+    distances, _ = KDTree(points.numpy()).query(points.numpy(), k=neighbours + 1)
     mean = torch.from_numpy(distances[:, 1:]).float().mean(-1)
     positive = mean[mean > 0]
     floor = _LEAST_SPACING * float(positive.median()) if len(positive) else 1.0
