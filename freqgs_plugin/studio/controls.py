@@ -1,8 +1,10 @@
 """Viewer controls, and what they say about how to draw. They touch pictures in the viewer only, never training."""
 
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -19,6 +21,21 @@ def in_viewer() -> bool:
     from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
     return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """A block that the viewer does not interrupt.
+
+    It abandons a render by raising from a trace function on whatever line comes next. In the middle of an import that
+    leaves a broken module behind, and the thread that draws dies of it at the next picture.
+    """
+    trace = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(trace)
 
 
 def lod_slider(num_levels: int, redraw: Callable[[Any], None]) -> ViewerSlider:

@@ -1,5 +1,6 @@
 """The base of both methods: splatfacto with a swappable rasterizer, level tags, a guard and restartable training."""
 
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -18,7 +19,7 @@ from freqgs_plugin.functional.attenuation import Attenuation
 from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
 from freqgs_plugin.rendering.render import render
 from freqgs_plugin.studio.cameras import to_camera
-from freqgs_plugin.studio.controls import Stopwatch, drawn_text, in_viewer
+from freqgs_plugin.studio.controls import Stopwatch, drawn_text, in_viewer, uninterrupted
 from freqgs_plugin.studio.lpips import lpips_if_available
 from freqgs_plugin.studio.optimizers import adopt_parameters, scale_schedulers
 from freqgs_plugin.studio.outputs import LazyOutputs
@@ -212,7 +213,9 @@ class FreqSplatModel(SplatfactoModel):
             gaussians = gaussians.select(self.crop_box.within(gaussians.means).flatten())
         viewer = in_viewer()
         attenuation = self._viewer_attenuation() if viewer else None
-        with Stopwatch(self.device) as watch:
+        # the first picture imports and compiles
+        finish = uninterrupted() if self._rasterizer is None else nullcontext()
+        with Stopwatch(self.device) as watch, finish:
             rendering = self.draw(gaussians, camera, background, attenuation, depth=True)
         if viewer:
             self.drawn.value = f"{rendering.info['drawn']:,} / {self.num_points:,}, {watch.milliseconds:.0f} ms"

@@ -1,5 +1,6 @@
 """What the viewer's controls change, and what they must leave alone."""
 
+import sys
 import threading
 
 import pytest
@@ -7,9 +8,10 @@ import torch
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
+from nerfstudio.viewer_legacy.server import viewer_utils
 from running import advance
 
-from freqgs_plugin.studio.controls import Stopwatch, in_viewer, level_cut, lod_slider
+from freqgs_plugin.studio.controls import Stopwatch, in_viewer, level_cut, lod_slider, uninterrupted
 
 
 class RenderThread(RenderStateMachine):
@@ -129,6 +131,64 @@ def test_writing_the_count_asks_for_no_new_picture(trainer):
     assert server.value == "5 / 5, 1 ms"
     trainer.pipeline.model.lod.install(server)
     assert len(server.hooks) == 1
+
+
+class Interrupted(Exception):
+    pass
+
+
+def test_the_viewer_cannot_interrupt_what_must_be_finished():
+    """As nerfstudio's SetTrace does: raise on the next line of Python, wherever that is."""
+    done = []
+
+    def interrupt(frame, event, arg):
+        if event == "line" and done:
+            raise Interrupted
+        return interrupt
+
+    def several_lines():
+        done.append(1)
+        done.append(2)
+        return len(done)
+
+    def guarded():
+        with uninterrupted():
+            several_lines()
+            done.append(3)
+        done.append(4)
+
+    before = sys.gettrace()
+    try:
+        with pytest.raises(Interrupted), viewer_utils.SetTrace(interrupt):
+            several_lines()
+        assert done == [1]
+        done.clear()
+        with pytest.raises(Interrupted), viewer_utils.SetTrace(interrupt):
+            guarded()
+        assert done == [1, 2, 3]
+    finally:
+        sys.settrace(before)
+
+
+def test_the_first_picture_is_finished(trainer):
+    """It imports the rasterizer: abandoned half-way, numba could not be imported again and the viewer stayed empty."""
+    model = trainer.pipeline.model
+    camera, _ = view(trainer)
+
+    def interrupt(frame, event, arg):
+        if event == "line" and "freqgs_plugin/rendering" in frame.f_code.co_filename:
+            raise Interrupted
+        return interrupt
+
+    before = sys.gettrace()
+    try:
+        model._rasterizer = None
+        with viewer_utils.SetTrace(interrupt):
+            assert "rgb" in model.get_outputs_for_camera(camera)
+        with pytest.raises(Interrupted), viewer_utils.SetTrace(interrupt):
+            model.get_outputs_for_camera(camera)
+    finally:
+        sys.settrace(before)
 
 
 def test_slider_and_cut():
