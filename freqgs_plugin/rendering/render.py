@@ -1,7 +1,9 @@
 """From Gaussians, a camera and an attenuation to a picture: the only path there is."""
 
+from typing import Any
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from freqgs_plugin.functional.attenuation import Attenuation
@@ -62,20 +64,57 @@ def render_prefixes(
 
     The last one's `info` describes all rows; see `PrefixRasterizer.prefixes` for what its `means2d` receives.
     """
-    splats = shade(gaussians, camera)
     options = {"background": background, "antialiased": antialiased}
+    return _composite_prefixes(
+        shade(gaussians, camera), gaussians.level, num_levels, camera, rasterizer, statistics, options
+    )
+
+
+def rendered_weight(
+    gaussians: Gaussians, camera: Camera, num_levels: int, *, rasterizer: Rasterizer, antialiased: bool = True
+) -> Float[Tensor, " n"]:
+    """How much of the picture each Gaussian makes up: its weight in front-to-back compositing, summed over pixels.
+
+    Summed over all prefixes that it belongs to, too, so that the base is not judged by what covers it. Occlusion
+    counts: the gradient of a picture of ones with respect to a feature of each Gaussian is just this sum.
+    """
+    probe = torch.zeros(len(gaussians), 1, device=gaussians.means.device, requires_grad=True)
+    splats = Splats(
+        gaussians.means.detach(),
+        gaussians.quats.detach(),
+        gaussians.scales.detach(),
+        gaussians.opacities.detach(),
+        probe,
+    )
+    with torch.enable_grad():
+        renderings = _composite_prefixes(
+            splats, gaussians.level, num_levels, camera, rasterizer, "full", {"antialiased": antialiased}
+        )
+        torch.stack([r.features.sum() for r in renderings]).sum().backward()
+    return probe.new_zeros(len(gaussians)) if probe.grad is None else probe.grad[:, 0]
+
+
+def _composite_prefixes(
+    splats: Splats,
+    level: Int[Tensor, " n"],
+    num_levels: int,
+    camera: Camera,
+    rasterizer: Rasterizer,
+    statistics: Statistics,
+    options: dict[str, Any],
+) -> list[Rendering]:
     if num_levels == 1:
         return [rasterizer(splats, camera, depth=False, **options)]
     if isinstance(rasterizer, PrefixRasterizer):
-        return rasterizer.prefixes(splats, gaussians.level, num_levels, camera, statistics=statistics, **options)
+        return rasterizer.prefixes(splats, level, num_levels, camera, statistics=statistics, **options)
     renderings, rows_drawn = [], []
     for k in range(1, num_levels + 1):
-        rows = torch.where(gaussians.level <= k)[0]
+        rows = torch.where(level <= k)[0]
         part = splats if k == num_levels else _rows(splats, rows)
         renderings.append(rasterizer(part, camera, depth=False, **options))
         rows_drawn.append(rows)
     if statistics == "own" and renderings[-1].info["means2d"].requires_grad:
-        renderings[-1] = _with_own_statistics(renderings, rows_drawn, gaussians.level)
+        renderings[-1] = _with_own_statistics(renderings, rows_drawn, level)
     return renderings
 
 

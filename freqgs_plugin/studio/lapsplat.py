@@ -11,7 +11,8 @@ from torch import Tensor
 from freqgs_plugin.functional.attenuation import Attenuation, LevelCut
 from freqgs_plugin.functional.image_loss import image_distance
 from freqgs_plugin.functional.pyramid import max_levels, reduce
-from freqgs_plugin.rendering.render import render_prefixes
+from freqgs_plugin.rendering.render import render_prefixes, rendered_weight
+from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.controls import level_cut, lod_slider
 from freqgs_plugin.studio.model import GROUPS, FreqSplatModel, FreqSplatModelConfig, show
 from freqgs_plugin.studio.optimizers import restart
@@ -54,6 +55,10 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """clamp pictures to [0, 1] before the loss: hard (the paper's code) stops gradients outside of it (ours: none)"""
     growth: Growth = "all"
     """which Gaussians may grow: all (the paper), newest level only, or each level from its own_prefix (ours)"""
+    least_weight: float = 1.0
+    """Gaussians whose weight over all training views is under this many pixels are removed; 0: none (ours)"""
+    least_views: int = 2
+    """Gaussians above level 1 that fewer training views show are removed; 0: none (ours)"""
     coarse_growth_factor: float = 1.0
     """densification threshold is multiplied by this for each level below the finest (1: the paper)"""
     lower_cull_alpha_thresh: float = 0.1
@@ -182,12 +187,37 @@ class LapSplatModel(FreqSplatModel):
     def _densify(self, step: int) -> None:
         assert self._info is not None
         self.strategy.observe(self.strategy_state, self._info, self._gradient_weights())
+        optimizers = self._optimizers.optimizers
+        dropped = self._drop_unneeded(optimizers) if self.schedule.drops_unneeded(step) else 0
         with self._lent_levels() as state:
-            done = self.strategy.step(self.gauss_params, self._optimizers.optimizers, state, step, self.schedule)
+            done = self.strategy.step(self.gauss_params, optimizers, state, step, self.schedule)
+        if dropped:
+            done["dropped (hardly seen)"] = dropped
         if done:
             what = ", ".join(f"{count:,} {name}" for name, count in done.items())
             levels = " / ".join(f"{c:,}" for c in self.level_counts())
             CONSOLE.log(f"Step {step}: {what}; now {self.num_points:,} Gaussians, by level {levels}.")
+
+    def _drop_unneeded(self, optimizers: Any) -> int:
+        """Remove Gaussians that the training views hardly show."""
+        config = self.config
+        if config.least_weight <= 0 and config.least_views <= 1:
+            return 0
+        gaussians = self.gaussians()
+        weights = [
+            rendered_weight(
+                gaussians,
+                to_camera(camera.to(self.device), halvings=self._halvings()),
+                self._stage,
+                rasterizer=self.rasterizer(),
+                antialiased=self.antialiased,
+            )
+            for camera in self._train_cameras()
+        ]
+        with self._lent_levels() as state:
+            return self.strategy.drop_unneeded(
+                self.gauss_params, optimizers, state, weights, config.least_weight, config.least_views
+            )
 
     def _gradient_weights(self) -> Float[Tensor, " n"]:
         """What each Gaussian's 2D gradient is divided by before it is compared with the densification threshold."""

@@ -1,5 +1,6 @@
 """The base of both methods: splatfacto with a swappable rasterizer, level tags, a guard and restartable training."""
 
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -247,6 +248,7 @@ class FreqSplatModel(SplatfactoModel):
         for name in GROUPS:
             optimizers.optimizers[name].register_step_pre_hook(lambda *_: self._check_gradients(trainer))
         self._optimizers = optimizers
+        self._all_train_cameras = attributes.pipeline.datamanager.train_dataset.cameras  # pyright: ignore
         self._viewer_redraw = trainer.viewer_state
         return [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self._before_step),
@@ -255,6 +257,11 @@ class FreqSplatModel(SplatfactoModel):
 
     def _adapt_to_images(self, height: int, width: int) -> None:
         """Before a new run: the smallest training image has this size, px."""
+
+    def _train_cameras(self) -> Iterator[Cameras]:
+        """The training views' cameras, one by one."""
+        for index in range(len(self._all_train_cameras)):
+            yield self._all_train_cameras[index : index + 1]
 
     def _set_up_schedule(self) -> None:
         """Build the schedule of this run, `_scale` being known."""

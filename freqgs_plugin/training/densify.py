@@ -10,6 +10,7 @@ from typing import Any, Literal
 import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import duplicate, remove
+from jaxtyping import Float
 from torch import Tensor
 
 from freqgs_plugin.training.schedule import Schedule
@@ -87,14 +88,40 @@ class LevelStrategy(DefaultStrategy):
             prune |= largest > self.prune_scale3d * state["scene_scale"]
             if step < self.refine_scale2d_stop_iter:
                 prune |= state["radii"] > self.prune_scale2d
-        for level in range(1, stage + 1):
-            # an empty level could never grow again: its most opaque Gaussian stays
-            rows = torch.where(state["level"] == level)[0]
-            if len(rows) and bool(prune[rows].all()):
-                prune[rows[opacity[rows].argmax()]] = False
+        self._keep_levels(prune, opacity, state["level"])
         if bool(prune.any()):
             remove(params=params, optimizers=optimizers, state=state, mask=prune)  # pyright: ignore
         return int(prune.sum())
+
+    @torch.no_grad()
+    def drop_unneeded(
+        self,
+        params: Any,
+        optimizers: Any,
+        state: dict[str, Any],
+        weights: list[Float[Tensor, " n"]],
+        least_weight: float | int,
+        least_views: int,
+    ) -> int:
+        """Remove what training views hardly show: `weights` are each view's `rendered_weight`, in pixels.
+
+        A Gaussian goes if its weight over all views is under `least_weight`, or if it is above level 1 and fewer than
+        `least_views` views show it with half a pixel's weight: nothing then says how it looks from elsewhere.
+        """
+        stacked = torch.stack(weights)
+        drop = stacked.sum(0) < least_weight
+        drop |= ((stacked > 0.5).sum(0) < min(least_views, len(weights))) & (state["level"] > 1)
+        self._keep_levels(drop, stacked.sum(0), state["level"])
+        if bool(drop.any()):
+            remove(params=params, optimizers=optimizers, state=state, mask=drop)
+        return int(drop.sum())
+
+    def _keep_levels(self, drop: Tensor, worth: Tensor, level: Tensor) -> None:
+        """Take the worthiest Gaussian of each level out of `drop` where all would go: an empty level cannot grow."""
+        for k in torch.unique(level).tolist():
+            rows = torch.where(level == k)[0]
+            if bool(drop[rows].all()):
+                drop[rows[worth[rows].argmax()]] = False
 
     @torch.no_grad()
     def _reset(self, params, optimizers: Any, state: dict[str, Any], stage: int) -> int:

@@ -60,6 +60,15 @@ class Schedule:
         last = step // self.reset_every * self.reset_every
         return last if self.resets(last) else 0
 
+    def drops_unneeded(self, step: int) -> bool:
+        """Whether Gaussians that training views hardly show are removed at `step`: before each reset, and at the end.
+
+        Not while a new level settles.
+        """
+        since_level = step - (self.stage(step) - 1) * self.level_interval
+        settled = self.stage(step) == 1 or since_level >= self.refine_pause
+        return settled and ((0 < step < self.refine_stop and step % self.reset_every == 0) or step == self.refine_stop)
+
     def resets(self, step: int) -> bool:
         """Whether opacities are reset at `step`."""
         return 0 < step < min(self.reset_stop, self.refine_stop) and step % self.reset_every == 0
