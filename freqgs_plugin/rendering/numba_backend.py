@@ -245,7 +245,6 @@ def warm_up() -> None:
     global _warm
     if _warm:
         return
-    _warm = True
     try:
         _render_speck()
     except ValueError as error:
@@ -254,6 +253,7 @@ def warm_up() -> None:
             "Install it with `pip install tbb`, or use --pipeline.model.rasterizer torch."
         ) from error
     check_layer()
+    _warm = True
 
 
 def _render_speck() -> None:

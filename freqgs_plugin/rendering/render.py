@@ -65,9 +65,13 @@ def render_prefixes(
     The last one's `info` describes all rows; see `PrefixRasterizer.prefixes` for what its `means2d` receives.
     """
     options = {"background": background, "antialiased": antialiased}
-    return _composite_prefixes(
+    renderings = _composite_prefixes(
         shade(gaussians, camera), gaussians.level, num_levels, camera, rasterizer, statistics, options
     )
+    means2d = renderings[-1].info["means2d"]
+    if means2d.requires_grad:
+        means2d.retain_grad()
+    return renderings
 
 
 def rendered_weight(

@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -38,8 +38,8 @@ def uninterrupted() -> Iterator[None]:
         sys.settrace(trace)
 
 
-def lod_slider(num_levels: int, redraw: Callable[[Any], None]) -> ViewerSlider:
-    """Slider over fractional levels 1..L, at L to begin with."""
+def lod_slider(num_levels: int) -> ViewerSlider:
+    """Slider over fractional levels 1..L, at L to begin with. nerfstudio draws anew whenever it moves."""
     return ViewerSlider(
         name="Level of detail",
         default_value=float(num_levels),
@@ -47,7 +47,6 @@ def lod_slider(num_levels: int, redraw: Callable[[Any], None]) -> ViewerSlider:
         max_value=float(max(num_levels, 2)),
         step=0.05,
         disabled=num_levels == 1,
-        cb_hook=redraw,
         hint="Draws levels up to this one; a fraction fades the next level in.",
     )
 

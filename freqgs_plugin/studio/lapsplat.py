@@ -53,6 +53,8 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """lambda_k of the image term for prefixes k < m (Eq. 12, the paper); 0 leaves them out"""
     clamp_in_loss: Literal["none", "hard", "straight_through"] = "none"
     """clamp pictures to [0, 1] before the loss: hard (the paper's code) stops gradients outside of it (ours: none)"""
+    strategy: Literal["default", "mcmc"] = "default"
+    """densification strategy; mcmc is refused, with the reason"""
     growth: Growth = "all"
     """which Gaussians may grow: all (the paper), newest level only, or each level from its own_prefix (ours)"""
     least_weight: float = 1.0
@@ -85,10 +87,9 @@ class LapSplatModel(FreqSplatModel):
             raise ValueError(f"num_levels is {config.num_levels}; it must be at least 1.")
         if config.level_interval < 1:
             raise ValueError(f"level_interval is {config.level_interval} steps; it must be at least 1.")
-        strategy = getattr(config, "strategy", "default")
-        if strategy != "default":
+        if config.strategy != "default":
             raise ValueError(
-                f"strategy '{strategy}' does not work with lapsplat: MCMC moves Gaussians between places and "
+                f"strategy '{config.strategy}' does not work with lapsplat: MCMC moves Gaussians between places and "
                 "overwrites the state in which level tags travel. Use the default strategy."
             )
 
@@ -97,11 +98,7 @@ class LapSplatModel(FreqSplatModel):
         self._stage = 1
         self._num_levels = self.config.num_levels
         self._targets = TargetCache(self.config.target_cache_mb)
-        self.lod = lod_slider(self.config.num_levels, lambda _: self._redraw())
-
-    def _redraw(self) -> None:
-        if self._viewer_redraw is not None:
-            self._viewer_redraw._trigger_rerender()
+        self.lod = lod_slider(self.config.num_levels)
 
     # -- schedule and densification -------------------------------------------------------------------------------
 
@@ -129,7 +126,7 @@ class LapSplatModel(FreqSplatModel):
             refine_every=refine,
             refine_start=scaled(config.warmup_length, s),
             refine_stop=stop,
-            refine_pause=scaled(config.refine_pause, s),
+            refine_pause=scaled(config.refine_pause, s, least=0),
             reset_every=reset,
             # after a reset every view is seen once; with thousands of views that must not end densification
             reset_pause=min(self.num_train_data + refine, reset // 2),
@@ -347,6 +344,7 @@ class LapSplatModel(FreqSplatModel):
         super().set_extra_state(state)
         self._stage = int(state["stage"])
         self._num_levels = int(state["num_levels"])
+        self.lod = lod_slider(self._num_levels)
 
     # -- pictures, evaluation, export -----------------------------------------------------------------------------
 

@@ -13,10 +13,10 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid
 from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel, SplatfactoModelConfig, get_color
 from nerfstudio.utils.rich_utils import CONSOLE
-from pytorch_msssim import SSIM
 from torch import Tensor
 
 from freqgs_plugin.functional.attenuation import Attenuation
+from freqgs_plugin.functional.image_loss import ssim
 from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
 from freqgs_plugin.rendering.render import render
 from freqgs_plugin.studio.cameras import to_camera
@@ -96,7 +96,6 @@ class FreqSplatModel(SplatfactoModel):
         from torchmetrics.image import PeakSignalNoiseRatio
 
         self.psnr = PeakSignalNoiseRatio(data_range=1.0)
-        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         random = self.config.background_color == "random"
         # splatfacto's: the viewer's default background stands in for random ones
         self.background_color = (
@@ -111,7 +110,6 @@ class FreqSplatModel(SplatfactoModel):
         self._info: dict[str, Any] | None = None
         self._step_is_finite = True
         self._rasterizer: Rasterizer | None = None
-        self._viewer_redraw: Any = None
         self.strategy = self._make_strategy()
         self.strategy_state: dict[str, Any] = {"scene_scale": 1.0, **dict.fromkeys(_STATISTICS)}
 
@@ -249,7 +247,6 @@ class FreqSplatModel(SplatfactoModel):
             optimizers.optimizers[name].register_step_pre_hook(lambda *_: self._check_gradients(trainer))
         self._optimizers = optimizers
         self._all_train_cameras = attributes.pipeline.datamanager.train_dataset.cameras  # pyright: ignore
-        self._viewer_redraw = trainer.viewer_state
         return [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self._before_step),
             TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._after_step),
@@ -331,7 +328,7 @@ class FreqSplatModel(SplatfactoModel):
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
         predicted = outputs["rgb"]
         a, b = target.permute(2, 0, 1)[None], predicted.permute(2, 0, 1)[None]
-        metrics = {"psnr": float(self.psnr(b, a)), "ssim": float(self.ssim(b, a)), "gaussians": float(self.num_points)}
+        metrics = {"psnr": float(self.psnr(b, a)), "ssim": float(ssim(b, a)), "gaussians": float(self.num_points)}
         lpips = lpips_if_available(self.device)
         metrics["lpips_computed"] = float(lpips is not None)
         if lpips is not None:

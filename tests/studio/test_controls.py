@@ -192,11 +192,11 @@ def test_the_first_picture_is_finished(trainer):
 
 
 def test_slider_and_cut():
-    slider = lod_slider(3, lambda _: None)
+    slider = lod_slider(3)
     assert (slider.min, slider.max, slider.value) == (1.0, 3.0, 3.0)
     slider.value = 1.25
     assert level_cut(slider).level == 1.25
-    single = lod_slider(1, lambda _: None)
+    single = lod_slider(1)
     assert single.disabled and single.min < single.max
 
 

@@ -379,13 +379,8 @@ def test_settings_that_cannot_be(make_trainer, settings, message):
 
 
 def test_mcmc_is_refused_with_the_reason(make_trainer):
-    """nerfstudio 1.1.5 has no such field; later versions do."""
-
-    def ask(config):
-        config.pipeline.model.strategy = "mcmc"
-
     with pytest.raises(ValueError, match=r"'mcmc' does not work with lapsplat: MCMC moves .* default strategy"):
-        make_trainer(edit=ask)
+        make_trainer(strategy="mcmc")
 
 
 def test_an_unknown_rasterizer_is_refused(make_trainer):

@@ -160,3 +160,23 @@ def test_level_prune_and_reset_on_one_step():
     assert done == {"duplicated": 6, "split": 0, "pruned": 2, "reset": 10}
     assert sorted(state["level"].tolist()) == [1] * 6 + [2] * 4
     assert all(len(p) == 10 for p in params.values())
+
+
+def test_what_views_hardly_show_is_dropped():
+    params, optimizers, state = scene([1, 1, 2, 2, 2])
+    # pixels in each of two views: little in all; much in one view; the same above level 1; in both; none
+    weights = [torch.tensor([0.3, 9.0, 9.0, 5.0, 0.0]), torch.tensor([0.3, 0.0, 0.1, 5.0, 0.0])]
+    assert strategy().drop_unneeded(params, optimizers, state, weights, 1.0, 2) == 3
+    assert parents(params) == [1, 3] and state["level"].tolist() == [1, 2]
+
+
+def test_dropping_never_empties_a_level():
+    params, optimizers, state = scene([1, 1, 2])
+    weights = [torch.tensor([0.1, 0.2, 0.0])] * 2
+    strategy().drop_unneeded(params, optimizers, state, weights, 1.0, 2)
+    assert parents(params) == [1, 2]
+
+
+def test_a_single_view_is_enough_where_there_is_only_one():
+    params, optimizers, state = scene([1, 2])
+    assert strategy().drop_unneeded(params, optimizers, state, [torch.tensor([5.0, 5.0])], 1.0, 2) == 0

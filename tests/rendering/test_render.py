@@ -1,0 +1,96 @@
+import pytest
+import torch
+
+import scenes
+from freqgs_plugin.functional.attenuation import LevelCut
+from freqgs_plugin.rendering.numba_backend import NumbaRasterizer
+from freqgs_plugin.rendering.render import render, render_prefixes, rendered_weight
+from freqgs_plugin.rendering.torch_backend import TorchRasterizer
+from freqgs_plugin.types import Gaussians
+
+CAMERA = scenes.camera(dtype=torch.float32)
+
+
+def gaussians(n=40):
+    s = scenes.splats(n, dtype=torch.float32)
+    generator = torch.Generator().manual_seed(3)
+    sh = torch.randn(n, 4, 3, generator=generator) * 0.3
+    level = torch.randint(1, 4, (n,), generator=generator, dtype=torch.int32)
+    return Gaussians(s.means, s.quats, s.scales, s.opacities, sh, level)
+
+
+@pytest.fixture(params=[NumbaRasterizer, TorchRasterizer])
+def rasterizer(request):
+    return request.param()
+
+
+def test_a_prefix_is_the_picture_of_its_levels(rasterizer, assert_close):
+    g = gaussians()
+    for k in (1, 2, 3):
+        cut = render(g, CAMERA, LevelCut(k), rasterizer=rasterizer)
+        alone = render(g.select(g.level <= k), CAMERA, rasterizer=rasterizer)
+        assert cut.info["drawn"] == int((g.level <= k).sum())
+        assert torch.equal(cut.features, alone.features)
+
+
+def test_training_and_viewing_show_the_same_prefixes(rasterizer, assert_close):
+    g = gaussians()
+    background = torch.tensor([0.2, 0.4, 0.6])
+    prefixes = render_prefixes(g, CAMERA, 3, rasterizer=rasterizer, background=background)
+    for k, prefix in enumerate(prefixes, start=1):
+        cut = render(g, CAMERA, LevelCut(k), rasterizer=rasterizer, background=background)
+        assert_close(prefix.features, cut.features, loosen=0.1)
+
+
+def test_level_zero_is_the_background(rasterizer):
+    background = torch.tensor([0.2, 0.4, 0.6])
+    picture = render(gaussians(), CAMERA, LevelCut(0), rasterizer=rasterizer, background=background)
+    assert torch.equal(picture.features, background.expand_as(picture.features))
+
+
+@pytest.mark.parametrize("statistics", ["own", "full"])
+def test_both_ways_to_render_prefixes_collect_the_same_statistics(statistics, assert_close):
+    """torch renders prefix by prefix, numba all in one pass."""
+    collected = []
+    for rasterizer in (TorchRasterizer(), NumbaRasterizer()):
+        g = gaussians()
+        g.means.requires_grad_()
+        prefixes = render_prefixes(g, CAMERA, 3, rasterizer=rasterizer, statistics=statistics)
+        weights = (1.0, 0.5, 2.0)
+        sum(w * p.features.square().sum() for w, p in zip(weights, prefixes, strict=True)).backward()
+        means2d = prefixes[-1].info["means2d"]
+        collected.append((means2d.grad, means2d.absgrad, g.means.grad))
+    for a, b in zip(*collected, strict=True):
+        assert ((a - b).norm() / b.norm()) < 1e-4
+
+
+def test_weights_add_up_to_what_is_covered(rasterizer, assert_close):
+    g = gaussians()
+    weight = rendered_weight(g, CAMERA, 1, rasterizer=rasterizer)
+    covered = render(g, CAMERA, rasterizer=rasterizer).alpha.sum()
+    assert_close(weight.sum(), covered, loosen=10)
+    assert (weight >= 0).all()
+
+
+def test_weights_count_every_prefix(rasterizer, assert_close):
+    g = gaussians()
+    expected = torch.zeros(len(g))
+    for k in (1, 2, 3):
+        rows = g.level <= k
+        expected[rows] += rendered_weight(g.select(rows), CAMERA, 1, rasterizer=rasterizer)
+    assert_close(rendered_weight(g, CAMERA, 3, rasterizer=rasterizer), expected, loosen=10)
+
+
+def test_what_is_covered_or_outside_weighs_nothing(rasterizer):
+    front, back, outside = (0.1, -0.05, 2.0), (0.1, -0.05, 4.0), (50.0, 0.0, 3.0)
+    n = 3
+    g = Gaussians(
+        means=torch.tensor([front, back, outside]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        scales=torch.tensor([[5.0] * 3, [0.01] * 3, [0.1] * 3]),
+        opacities=torch.tensor([1.0, 1.0, 1.0]),
+        sh=torch.zeros(n, 1, 3),
+        level=torch.ones(n, dtype=torch.int32),
+    )
+    weight = rendered_weight(g, scenes.camera(width=9, height=9, dtype=torch.float32), 1, rasterizer=rasterizer)
+    assert weight[0] > 50 and weight[1] < 0.1 and weight[2] == 0
