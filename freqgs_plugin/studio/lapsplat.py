@@ -39,8 +39,8 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """steps without densification after a new level (the paper)"""
     multiresolution: bool = True
     """stage m trains at 1 / 2^(L - m) of full size (the paper)"""
-    stop_split_at: int = 30_000
-    """densification ends at this step (the paper: never)"""
+    stop_split_at: int = 27_000
+    """densification ends at this step, so that the last Gaussians can settle (ours; the paper: never)"""
     signed_residuals: bool = True
     """levels above 1 hold colours in [-1, inf) (Eq. 4); off: [0, inf) for all, which exports as a plain PLY"""
     image_weight: float = 1.0
@@ -49,20 +49,22 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """weight of the frequency term (Eq. 13, the paper); 0 leaves it out"""
     dft_norm: Literal["backward", "ortho"] = "backward"
     """scaling of the DFT: none (the paper; the term then grows with image size) or 1 / sqrt(pixels)"""
-    lower_level_weight: float = 0.1
-    """lambda_k of the image term for prefixes k < m (Eq. 12, the paper); 0 leaves them out"""
+    lower_level_weight: float = 0.2
+    """lambda_k of the image term for prefixes k < m (Eq. 12; ours, the paper: 0.1); 0 leaves them out"""
     clamp_in_loss: Literal["none", "hard", "straight_through"] = "none"
     """clamp pictures to [0, 1] before the loss: hard (the paper's code) stops gradients outside of it (ours: none)"""
     strategy: Literal["default", "mcmc"] = "default"
     """densification strategy; mcmc is refused, with the reason"""
-    growth: Growth = "all"
-    """which Gaussians may grow: all (the paper), newest level only, or each level from its own_prefix (ours)"""
+    growth: Growth = "newest"
+    """which Gaussians may grow: all (the paper), the newest level's (ours), or each level from its own_prefix"""
+    densify_grad_thresh: float = 0.0006
+    """2D gradient, in units of half the image, above which a Gaussian grows (ours; splatfacto: 0.0008)"""
     least_weight: float = 1.0
     """Gaussians whose weight over all training views is under this many pixels are removed; 0: none (ours)"""
     least_views: int = 2
     """Gaussians above level 1 that fewer training views show are removed; 0: none (ours)"""
-    coarse_growth_factor: float = 1.0
-    """densification threshold is multiplied by this for each level below the finest (1: the paper)"""
+    coarse_growth_factor: float = 1.8
+    """densification threshold is multiplied by this for each level below the finest (ours; the paper: 1)"""
     lower_cull_alpha_thresh: float = 0.1
     """opacity under which Gaussians of levels below the newest are pruned (the paper: as the newest)"""
     reset_levels: Literal["all", "newest"] = "all"
