@@ -61,9 +61,13 @@ def _load_tbb() -> bool:
 
 
 def _choose_layer() -> None:
-    """Ask numba for a thread-safe layer, tbb where it is installed. NUMBA_THREADING_LAYER wins."""
+    """Ask numba for a thread-safe layer: tbb, or else omp. NUMBA_THREADING_LAYER wins.
+
+    tbb is out of reach where another package has loaded its own old copy before (open3d and pymeshlab do); numba warns.
+    """
     if "NUMBA_THREADING_LAYER" not in os.environ:
-        numba.config.THREADING_LAYER = "tbb" if _load_tbb() else "threadsafe"  # pyright: ignore
+        _load_tbb()
+        numba.config.THREADING_LAYER = "threadsafe"  # pyright: ignore
 
 
 def check_layer() -> str:
