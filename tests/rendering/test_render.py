@@ -1,7 +1,7 @@
 import pytest
+import scenes
 import torch
 
-import scenes
 from freqgs_plugin.functional.attenuation import LevelCut
 from freqgs_plugin.rendering.numba_backend import NumbaRasterizer
 from freqgs_plugin.rendering.render import render, render_prefixes, rendered_weight
