@@ -16,6 +16,8 @@ from torch import Tensor
 from freqgs_plugin.training.schedule import Schedule
 
 Growth = Literal["all", "newest", "own_prefix"]
+_MOST_DROPPED = 0.9
+"""share of all Gaussians above which `drop_unneeded` removes none"""
 
 
 @dataclass
@@ -107,10 +109,13 @@ class LevelStrategy(DefaultStrategy):
 
         A Gaussian goes if its weight over all views is under `least_weight`, or if it is above level 1 and fewer than
         `least_views` views show it with half a pixel's weight: nothing then says how it looks from elsewhere.
+        None go where nearly all would: then the views show no scene to judge by.
         """
         stacked = torch.stack(weights)
         drop = stacked.sum(0) < least_weight
         drop |= ((stacked > 0.5).sum(0) < min(least_views, len(weights))) & (state["level"] > 1)
+        if float(drop.float().mean()) > _MOST_DROPPED:
+            return 0
         self._keep_levels(drop, stacked.sum(0), state["level"])
         if bool(drop.any()):
             remove(params=params, optimizers=optimizers, state=state, mask=drop)

@@ -177,6 +177,13 @@ def test_dropping_never_empties_a_level():
     assert parents(params) == [1, 2]
 
 
+def test_views_that_show_next_to_nothing_drop_nothing():
+    params, optimizers, state = scene([1] * 20)
+    weights = [torch.tensor([5.0] + [0.0] * 19)] * 2
+    assert strategy().drop_unneeded(params, optimizers, state, weights, 1.0, 2) == 0
+    assert len(params["means"]) == 20
+
+
 def test_a_single_view_is_enough_where_there_is_only_one():
     params, optimizers, state = scene([1, 2])
     assert strategy().drop_unneeded(params, optimizers, state, [torch.tensor([5.0, 5.0])], 1.0, 2) == 0
