@@ -171,10 +171,10 @@ def test_what_views_hardly_show_is_dropped():
 
 
 def test_dropping_never_empties_a_level():
-    params, optimizers, state = scene([1, 1, 2])
-    weights = [torch.tensor([0.1, 0.2, 0.0])] * 2
-    strategy().drop_unneeded(params, optimizers, state, weights, 1.0, 2)
-    assert parents(params) == [1, 2]
+    params, optimizers, state = scene([1, 1, 1, 2, 2])
+    weights = [torch.tensor([5.0, 5.0, 0.0, 0.0, 0.2])] * 2
+    assert strategy().drop_unneeded(params, optimizers, state, weights, 1.0, 2) == 2
+    assert parents(params) == [0, 1, 4] and state["level"].tolist() == [1, 1, 2]
 
 
 def test_views_that_show_next_to_nothing_drop_nothing():
