@@ -7,7 +7,7 @@ from pathlib import Path
 def demo(
     output_dir: Path = Path("demo-out"),
     scene_only: Path | None = None,
-    steps: int = 1500,
+    steps: int = 2500,
     levels: int = 3,
     seed: int = 0,
     views: int = 36,
