@@ -31,6 +31,8 @@ class Gaussians:
     """Laplacian-pyramid level, 1..L"""
     signed_residuals: bool = True
     """levels above 1 hold colours in [-1, inf) instead of [0, inf) (Eq. 4 against Eq. 3)"""
+    decay: Float[Tensor, " n"] | None = None
+    """sigma of the distance decay, in normalised distances; at or below 0: dead. None: opacities do not decay"""
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -45,6 +47,7 @@ class Gaussians:
             sh=self.sh[rows],
             level=self.level[rows],
             signed_residuals=self.signed_residuals,
+            decay=None if self.decay is None else self.decay[rows],
         )
 
 

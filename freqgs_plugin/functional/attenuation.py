@@ -1,17 +1,33 @@
 """How much of each Gaussian is drawn: a weight in [0, 1] per row. Level of detail is one of these, passed to `render`.
 
-Weights multiply opacities. Two attenuations combine by `Product`.
+Weights multiply opacities. Two attenuations combine by `Product`. Equation numbers are those of the paper on continuous
+level of detail (CLoD-GS).
 """
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from freqgs_plugin.functional.projection import NEAR_PLANE
 from freqgs_plugin.types import Camera, Gaussians
+
+TAU = 1.0 / 255.0
+"""τ: opacities at or below `TAU * scale` are not drawn. Rasterizers skip what is fainter than this anyway"""
+EPSILON = 1e-8
+"""ε of Eq. 2"""
+Reference = Literal["frustum_max", "frustum_quantile", "scene"]
+"""what distances are divided by: the largest distance of a Gaussian in the frustum (the paper), the 0.99 quantile of
+those distances, or one number that belongs to the scene and does not change with the view"""
+_QUANTILE = 0.99
+_LEAST_OPACITY = 1e-30
+_LARGEST_DECAY = 1e15
+_FARTHEST = 1e18
+_FADED = 100.0
+"""a distance of more than this many sqrt(2) sigma counts as this many: exp(-1e4) is 0 in every dtype"""
 
 
 @runtime_checkable
@@ -61,3 +77,144 @@ class Product:
         for part in self.parts:
             weight = weight * part(gaussians, camera)
         return weight
+
+
+@dataclass(frozen=True)
+class DistanceDecay:
+    """Opacities that fall with distance, and a cut under which nothing is drawn (Eq. 2 and the mask M below it).
+
+    α'' = α exp(-(d' s)^2 / (2 max(σ, 0)^2 + ε)), drawn only where α'' > τ s. The weight is α'' / α there and 0
+    elsewhere; it falls with `scale` and with distance, and rises with σ. Computed in float32 at least, under autocast
+    too. The distance has no gradient: fading must not move Gaussians.
+
+    A dead decay (σ <= 0) has weight 0, except at the camera's centre, and no gradient. A faint Gaussian (α <= τ s) has
+    weight 0 at any distance.
+    """
+
+    scale: float | int = 1.0
+    """s_v, the virtual distance scale, > 0: 1 is the scene as trained, 2 as if seen from twice as far"""
+    reference: Reference = "scene"
+    """what distances are divided by"""
+    scene_distance: float | int | None = None
+    """world units, for the reference `scene`"""
+    soft: bool = True
+    """fade between 1 and 2 times the threshold, so that nothing pops (ours); off: a step at the threshold (the paper).
+    Which Gaussians have weight 0 is the same"""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale < math.inf:
+            raise ValueError(f"scale is {self.scale}; it must be a finite number > 0 (1 is the scene as trained).")
+        _check_reference(self.reference, self.scene_distance)
+
+    def __call__(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
+        distance = normalised_distance(gaussians, camera, self.reference, self.scene_distance)
+        decay = _decay_of(gaussians)
+        margin = log_attenuated(gaussians.opacities, distance, decay, self.scale) - math.log(TAU * self.scale)
+        weight = torch.exp(log_decay(distance, decay, self.scale))
+        if not self.soft:
+            return weight * (margin > 0)
+        fade = torch.expm1(margin.clamp(0.0, math.log(2.0))).clamp_max(1.0)
+        return weight * fade * fade * (3.0 - 2.0 * fade)
+
+    def margin(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
+        """ln α'' - ln(τ s) of every Gaussian: it is drawn where this is positive."""
+        distance = normalised_distance(gaussians, camera, self.reference, self.scene_distance)
+        log_alpha = log_attenuated(gaussians.opacities, distance, _decay_of(gaussians), self.scale)
+        return log_alpha - math.log(TAU * self.scale)
+
+
+def log_decay(distance: Float[Tensor, " n"], decay: Float[Tensor, " n"], scale: float | int) -> Float[Tensor, " n"]:
+    """-(d' s)^2 / (2 max(σ, 0)^2 + ε), at least -1e4: the exponent of Eq. 2, with finite gradients for any σ."""
+    distance, decay = _at_least_float32(distance), _at_least_float32(decay)
+    far = (distance * min(float(scale), _FARTHEST)).clamp_max(_FARTHEST)
+    # squared last: the quotient and its derivatives stay in range where the squares would not
+    ratio = far / (2.0 * decay.clamp(0.0, _LARGEST_DECAY).square() + EPSILON).sqrt()
+    return -ratio.clamp_max(_FADED).square()
+
+
+def log_attenuated(
+    opacities: Float[Tensor, " n"], distance: Float[Tensor, " n"], decay: Float[Tensor, " n"], scale: float | int
+) -> Float[Tensor, " n"]:
+    """ln α'' (Eq. 2) from α in [0, 1], the normalised distance d', σ and s_v. Drawn where it is > ln(TAU * scale).
+
+    α counts as at least 1e-30, so that the logarithm is finite; below, its gradient is 0.
+    """
+    return _at_least_float32(opacities).clamp_min(_LEAST_OPACITY).log() + log_decay(distance, decay, scale)
+
+
+def normalised_distance(
+    gaussians: Gaussians, camera: Camera, reference: Reference = "scene", scene_distance: float | int | None = None
+) -> Float[Tensor, " n"]:
+    """d': distance from the camera's centre to each mean, divided by the reference; without gradient.
+
+    In the frustum are the Gaussians whose centres lie in front of the near plane and project into the image. Where
+    there is none, all Gaussians stand in for them. Where all lie at the camera's centre, d' is 0.
+
+    Raises:
+        ValueError: the reference `scene` without a distance > 0.
+    """
+    _check_reference(reference, scene_distance)
+    distance, in_frustum = _distances(gaussians, camera)
+    if reference == "scene":
+        assert scene_distance is not None
+        return distance / scene_distance
+    if not len(distance):
+        return distance
+    largest = _frustum_distance(distance, in_frustum, reference)
+    return torch.where(largest > 0, distance / torch.where(largest > 0, largest, 1.0), 0.0)
+
+
+def frustum_distance(
+    gaussians: Gaussians, camera: Camera, reference: Literal["frustum_max", "frustum_quantile"] = "frustum_max"
+) -> float:
+    """The distance that `normalised_distance` divides by for one view, world units; 0 without Gaussians."""
+    distance, in_frustum = _distances(gaussians, camera)
+    return float(_frustum_distance(distance, in_frustum, reference)) if len(distance) else 0.0
+
+
+@torch.no_grad()
+def _distances(gaussians: Gaussians, camera: Camera) -> tuple[Float[Tensor, " n"], Bool[Tensor, " n"]]:
+    """World distance of each mean from the camera's centre, and which means the image shows."""
+    means = _at_least_float32(gaussians.means)
+    # autocast would take these products at half precision
+    with torch.autocast(means.device.type, enabled=False):
+        viewmat, intrinsics = camera.viewmat.to(means), camera.K.to(means)
+        x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
+    front = z > NEAR_PLANE
+    depth = torch.where(front, z, 1.0)
+    u = x / depth * intrinsics[0, 0] + intrinsics[0, 2]
+    v = y / depth * intrinsics[1, 1] + intrinsics[1, 2]
+    inside = front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+    return torch.linalg.vector_norm(torch.stack([x, y, z], -1), dim=-1), inside
+
+
+def _frustum_distance(
+    distance: Float[Tensor, " n"], in_frustum: Bool[Tensor, " n"], reference: Reference
+) -> Float[Tensor, ""]:
+    shown = distance[in_frustum] if bool(in_frustum.any()) else distance
+    if reference == "frustum_max":
+        return shown.max()
+    return shown.kthvalue(math.ceil(_QUANTILE * len(shown))).values
+
+
+def _check_reference(reference: str, scene_distance: float | None) -> None:
+    if reference not in ("frustum_max", "frustum_quantile", "scene"):
+        raise ValueError(f"reference is '{reference}'; choose frustum_max, frustum_quantile or scene.")
+    if reference == "scene" and not (scene_distance is not None and 0 < scene_distance < math.inf):
+        raise ValueError(
+            f"scene_distance is {scene_distance}; the reference 'scene' needs a distance > 0 in world units, which a "
+            "trained run holds. Without one, choose frustum_max or frustum_quantile."
+        )
+
+
+def _decay_of(gaussians: Gaussians) -> Float[Tensor, " n"]:
+    if gaussians.decay is None:
+        raise ValueError(
+            "these Gaussians have no decay, so distance cannot fade them. Train them with clodsplat, or give them one "
+            "(`dataclasses.replace(gaussians, decay=...)`)."
+        )
+    return gaussians.decay
+
+
+def _at_least_float32(x: Tensor) -> Tensor:
+    return x.to(torch.promote_types(x.dtype, torch.float32))
