@@ -108,7 +108,7 @@ class DistanceDecay:
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
         distance = normalised_distance(gaussians, camera, self.reference, self.scene_distance)
-        decay = _decay_of(gaussians)
+        decay = decay_of(gaussians)
         margin = log_attenuated(gaussians.opacities, distance, decay, self.scale) - math.log(TAU * self.scale)
         weight = torch.exp(log_decay(distance, decay, self.scale))
         if not self.soft:
@@ -119,7 +119,7 @@ class DistanceDecay:
     def margin(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
         """ln α'' - ln(τ s) of every Gaussian: it is drawn where this is positive."""
         distance = normalised_distance(gaussians, camera, self.reference, self.scene_distance)
-        log_alpha = log_attenuated(gaussians.opacities, distance, _decay_of(gaussians), self.scale)
+        log_alpha = log_attenuated(gaussians.opacities, distance, decay_of(gaussians), self.scale)
         return log_alpha - math.log(TAU * self.scale)
 
 
@@ -207,7 +207,8 @@ def _check_reference(reference: str, scene_distance: float | None) -> None:
         )
 
 
-def _decay_of(gaussians: Gaussians) -> Float[Tensor, " n"]:
+def decay_of(gaussians: Gaussians) -> Float[Tensor, " n"]:
+    """The Gaussians' decay; a ValueError where they have none."""
     if gaussians.decay is None:
         raise ValueError(
             "these Gaussians have no decay, so distance cannot fade them. Train them with clodsplat, or give them one "
