@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from freqgs_plugin.functional.numba_threads import njit, prange
+from freqgs_plugin.functional.projection import QUATERNION_MIN, STD_MAX
 from freqgs_plugin.rendering.base import ALPHA_MIN, FOV_MARGIN, NEAR_PLANE, RADIUS_SIGMAS
 
 # columns of a projected Gaussian: centre (px), conic / 2 on the diagonal, opacity after compensation, and the
@@ -33,13 +34,21 @@ def _rotation(w, x, y, z):
 
 @njit(error_model="numpy", fastmath={"contract"}, cache=True)
 def _unit(quats, i):
-    """Normalised quaternion and 1/norm; the identity, with 0 for 1/norm, where all components are zero."""
+    """Normalised quaternion and 1/norm; the identity, with 0 for 1/norm, where no component is above the minimum."""
     w, x, y, z = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
-    norm = math.sqrt(w * w + x * x + y * y + z * z)
-    if not norm > 0.0:
+    if not max(max(abs(w), abs(x)), max(abs(y), abs(z))) > QUATERNION_MIN:
         return 1.0, 0.0, 0.0, 0.0, 0.0
-    inverse = 1.0 / norm
+    inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+
+
+@njit(error_model="numpy", fastmath={"contract"}, cache=True)
+def _sizes(scales, i, fx, fy, iz):
+    """Scales, limited to about `STD_MAX` pixels, and 1 for each that is not limited, else 0."""
+    limit = STD_MAX / (max(fx, fy) * iz)
+    s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
+    free = (1.0 if s0 <= limit else 0.0, 1.0 if s1 <= limit else 0.0, 1.0 if s2 <= limit else 0.0)
+    return (min(s0, limit), min(s1, limit), min(s2, limit)), free
 
 
 @njit(error_model="numpy", fastmath={"contract"}, cache=True)
@@ -82,7 +91,7 @@ def _project_one(
     j0, j1 = _jacobian(R, fx, fy, iz, min(max(u, low_u), high_u), min(max(v, low_v), high_v))
     qw, qx, qy, qz, _ = _unit(quats, i)
     M = _rotation(qw, qx, qy, qz)
-    s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
+    (s0, s1, s2), _ = _sizes(scales, i, fx, fy, iz)
     b00, b01, b02 = _row(j0, M, 0) * s0, _row(j0, M, 1) * s1, _row(j0, M, 2) * s2
     b10, b11, b12 = _row(j1, M, 0) * s0, _row(j1, M, 1) * s1, _row(j1, M, 2) * s2
     a = b00 * b00 + b01 * b01 + b02 * b02
@@ -164,7 +173,7 @@ def _carry_back_one(
     j0, j1 = _jacobian(R, fx, fy, iz, tu, tv)
     qw, qx, qy, qz, inverse_norm = _unit(quats, i)
     M = _rotation(qw, qx, qy, qz)
-    s = (np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2]))
+    s, free = _sizes(scales, i, fx, fy, iz)
     h0 = (_row(j0, M, 0), _row(j0, M, 1), _row(j0, M, 2))
     h1 = (_row(j1, M, 0), _row(j1, M, 1), _row(j1, M, 2))
     b0 = (h0[0] * s[0], h0[1] * s[1], h0[2] * s[2])
@@ -205,9 +214,9 @@ def _carry_back_one(
         2.0 * g_c * b1[1] + g_b * b0[1] + gk[2] * b0[0] - gk[0] * b0[2],
         2.0 * g_c * b1[2] + g_b * b0[2] + gk[0] * b0[1] - gk[1] * b0[0],
     )
-    v_scales[i, 0] = gb0[0] * h0[0] + gb1[0] * h1[0]
-    v_scales[i, 1] = gb0[1] * h0[1] + gb1[1] * h1[1]
-    v_scales[i, 2] = gb0[2] * h0[2] + gb1[2] * h1[2]
+    v_scales[i, 0] = free[0] * (gb0[0] * h0[0] + gb1[0] * h1[0])
+    v_scales[i, 1] = free[1] * (gb0[1] * h0[1] + gb1[1] * h1[1])
+    v_scales[i, 2] = free[2] * (gb0[2] * h0[2] + gb1[2] * h1[2])
     gh0 = (gb0[0] * s[0], gb0[1] * s[1], gb0[2] * s[2])
     gh1 = (gb1[0] * s[0], gb1[1] * s[1], gb1[2] * s[2])
 
