@@ -1,9 +1,13 @@
 """Perspective projection of 3D Gaussians to 2D ones: EWA splatting as in gsplat's `fully_fused_projection`.
 
-Everything is elementwise on unbound components: batches of 3x3 products are slow on a CPU. The determinant of the
-projected covariance is a cross product, because `a c - b^2` loses every digit for needle-shaped Gaussians.
+Everything is elementwise on unbound components: batches of 3x3 products are slow on a CPU, and under autocast they would
+be taken in half precision. The determinant of the projected covariance is a cross product, because `a c - b^2` loses every
+digit for needle-shaped Gaussians. Whatever the dtype, the arithmetic is in float64, as in the compiled kernels: that is a
+twentieth of a picture's time, and in float32 scenes far from the origin lose their digits and gradients by scales above
+1e5 px are wrong, because the squared determinant underflows.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +23,7 @@ FOV_MARGIN = 0.15
 RADIUS_SIGMAS = 3.0
 """the radius is this many standard deviations of the longer axis"""
 STD_MAX = 1e8
-"""scales are limited to about this many pixels on the image plane: beyond, float32 determinants overflow"""
+"""scales are limited to about this many pixels on the image plane: beyond, conics underflow in float32"""
 QUATERNION_MIN = 1e-20
 """a quaternion with no component above this has no direction and counts as the identity"""
 
@@ -74,11 +78,15 @@ def project(
 
     cov = J R M M^T R^T J^T + blur I with M = rotation * scales, R the camera's rotation and J the Jacobian of the
     perspective division at the mean, held within `FOV_MARGIN` of the image (EWA splatting, Zwicker et al. 2001).
-    `blur` is a variance, px^2. Rows that are culled get finite values and no gradient.
+    `blur` is a variance, px^2. Rows that are culled get finite values and no gradient. The result has the dtype of `means`.
     """
-    viewmat, intrinsics = camera.viewmat.to(means), camera.K.to(means)
+    dtype = means.dtype
+    means, quats, scales, viewmat, intrinsics = (
+        t.to(means.device, _working_dtype(means)) for t in (means, quats, scales, camera.viewmat, camera.K)
+    )
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
-    x, y, depths = (means @ rotation.T + translation).unbind(-1)
+    point = means.unbind(-1)
+    x, y, depths = (_dot(rotation[k].unbind(), point) + translation[k] for k in range(3))
     in_front = depths > NEAR_PLANE
     inverse_z = 1 / torch.where(in_front, depths, 1.0)
     u, v = x * inverse_z, y * inverse_z
@@ -101,15 +109,20 @@ def project(
     conics = torch.stack([cov_yy, -cov_xy, cov_xx], dim=-1) * inverse_det[:, None]
     radii = _radii(means2d.detach(), cov_xx.detach(), cov_yy.detach(), det.detach(), drawable, camera)
     return Projected(
-        means2d=means2d,
-        conics=conics,
-        depths=depths,
-        cov_xx=cov_xx.detach(),
-        cov_yy=cov_yy.detach(),
-        compensation=_safe_sqrt(det_sharp * inverse_det),
+        means2d=means2d.to(dtype),
+        conics=conics.to(dtype),
+        depths=depths.to(dtype),
+        cov_xx=cov_xx.detach().to(dtype),
+        cov_yy=cov_yy.detach().to(dtype),
+        compensation=_safe_sqrt(det_sharp * inverse_det).to(dtype),
         radii=radii,
         visible=radii > 0,
     )
+
+
+def _working_dtype(like: Tensor) -> torch.dtype:
+    """float64 where the device has it."""
+    return torch.float32 if like.device.type == "mps" else torch.float64
 
 
 def _jacobian_row(
@@ -145,7 +158,7 @@ def _footprint_rows(
     return row_x, row_y
 
 
-def _dot(a: list[Float[Tensor, " n"]], b: list[Float[Tensor, " n"]]) -> Float[Tensor, " n"]:
+def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Float[Tensor, " n"]:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
