@@ -1,9 +1,9 @@
 """Perspective projection of 3D Gaussians to 2D ones: EWA splatting as in gsplat's `fully_fused_projection`.
 
-Everything is elementwise on unbound components: batches of 3x3 products are slow on a CPU, and under autocast they would
-be taken in half precision. The determinant of the projected covariance is a cross product, because `a c - b^2` loses every
-digit for needle-shaped Gaussians. Whatever the dtype, the arithmetic is in float64, as in the compiled kernels: that is a
-twentieth of a picture's time, and in float32 scenes far from the origin lose their digits and gradients by scales above
+Everything is elementwise on unbound components: batches of 3x3 products are slow on a CPU, and autocast would take them
+in half precision. The determinant of the projected covariance is a cross product, because `a c - b^2` loses every digit
+for needle-shaped Gaussians. Whatever the dtype, the arithmetic is in float64, as in the compiled kernels. That is a
+twentieth of a picture's time; in float32, scenes far from the origin lose their digits, and gradients by scales above
 1e5 px are wrong, because the squared determinant underflows.
 """
 
@@ -78,7 +78,8 @@ def project(
 
     cov = J R M M^T R^T J^T + blur I with M = rotation * scales, R the camera's rotation and J the Jacobian of the
     perspective division at the mean, held within `FOV_MARGIN` of the image (EWA splatting, Zwicker et al. 2001).
-    `blur` is a variance, px^2. Rows that are culled get finite values and no gradient. The result has the dtype of `means`.
+    `blur` is a variance, px^2. Rows that are culled get finite values and no gradient. The result has
+    the dtype of `means`.
     """
     dtype = means.dtype
     means, quats, scales, viewmat, intrinsics = (

@@ -5,6 +5,7 @@ another.
 """
 
 import importlib
+import math
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Literal, Protocol, runtime_checkable
@@ -97,6 +98,43 @@ class PrefixRasterizer(Rasterizer, Protocol):
         names.
         """
         ...
+
+
+def check_inputs(splats: Splats, camera: Camera) -> None:
+    """Refuse what no picture can be made of: every backend calls this first.
+
+    Raises:
+        ValueError: a number that is not finite, an image without pixels, or a focal length that is not positive.
+    """
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(f"camera is {camera.width}x{camera.height} px; both sides must be at least 1.")
+    for name in ("viewmat", "K"):
+        matrix: Tensor = getattr(camera, name)
+        if not bool(torch.isfinite(matrix).all()):
+            raise ValueError(
+                f"the camera's {name} is not finite: {matrix.tolist()}. Check the camera's pose and model."
+            )
+    focal = [float(camera.K[k, k]) for k in range(2)]
+    if not min(focal) > 0:
+        raise ValueError(f"focal lengths are {focal[0]:g} and {focal[1]:g} px; both must be > 0.")
+    for name in ("means", "quats", "scales", "opacities", "features"):
+        values: Tensor = getattr(splats, name).detach()
+        # one pass without a mask; a finite sum has finite terms only
+        if math.isfinite(float(values.sum(dtype=_sum_dtype(values)))):
+            continue
+        bad = ~torch.isfinite(values).reshape(len(values), -1).all(-1)
+        rows = torch.nonzero(bad).squeeze(1)
+        if len(rows):
+            first = int(rows[0])
+            raise ValueError(
+                f"{name} of {len(rows)} of {len(values)} Gaussians are not finite (first: row {first}, "
+                f"{values[first].tolist()}). Remove these Gaussians, or go back to a checkpoint before they appeared."
+            )
+
+
+def _sum_dtype(values: Tensor) -> torch.dtype:
+    """Half precision would overflow."""
+    return torch.float32 if values.dtype.itemsize < 4 else values.dtype
 
 
 Factory = Callable[[bool], Rasterizer]

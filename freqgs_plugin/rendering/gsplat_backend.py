@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
-from freqgs_plugin.rendering.base import BLUR, NEAR_PLANE
+from freqgs_plugin.rendering.base import BLUR, NEAR_PLANE, check_inputs
 from freqgs_plugin.types import Camera, Rendering, Splats
 
 _INFO_KEYS = ("means2d", "depths", "conics", "opacities", "width", "height", "n_cameras", "gaussian_ids", "camera_ids")
@@ -43,6 +43,7 @@ class GsplatRasterizer:
             RuntimeError: no CUDA device, no gsplat, or no compiled kernels; the message names what is missing.
         """
         rasterization = _rasterization(splats.means)
+        check_inputs(splats, camera)
         if len(splats) == 0:
             return _empty(splats, camera, background)
         image, alpha, meta = rasterization(

@@ -13,7 +13,7 @@ from numba import get_num_threads
 from torch import Tensor
 
 from freqgs_plugin.functional.numba_threads import check_layer
-from freqgs_plugin.rendering.base import BLUR, Statistics
+from freqgs_plugin.rendering.base import BLUR, Statistics, check_inputs
 from freqgs_plugin.rendering.numba_binning import depth_order, tile_lists
 from freqgs_plugin.rendering.numba_compositing import composite, composite_backward
 from freqgs_plugin.rendering.numba_projection import COLUMNS, OPACITY, V_COLUMNS, project, project_backward
@@ -52,8 +52,7 @@ def _check(splats: Splats, camera: Camera) -> None:
                 f"the numba rasterizer takes float32 tensors on the CPU, but {name} is {tensor.dtype} on "
                 f"{tensor.device}. Convert it, or use the torch rasterizer."
             )
-    if camera.width < 1 or camera.height < 1:
-        raise ValueError(f"camera is {camera.width}x{camera.height} px; both sides must be at least 1.")
+    check_inputs(splats, camera)
 
 
 def _feature_groups(features: Tensor) -> list[Any]:

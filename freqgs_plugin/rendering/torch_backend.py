@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from freqgs_plugin.functional.projection import Projected, project
-from freqgs_plugin.rendering.base import ALPHA_MIN, BLUR
+from freqgs_plugin.rendering.base import ALPHA_MIN, BLUR, check_inputs
 from freqgs_plugin.rendering.torch_compositing import backward_tiles, forward_tiles, splat_table
 from freqgs_plugin.rendering.torch_tiles import bin_splats
 from freqgs_plugin.types import Camera, Rendering, Splats
@@ -34,6 +34,7 @@ class TorchRasterizer:
         depth: bool = True,
     ) -> Rendering:
         """Render `splats`, in the dtype and on the device of its tensors."""
+        check_inputs(splats, camera)
         projected = project(splats.means, splats.quats, splats.scales, camera, blur)
         opacities = splats.opacities * projected.compensation if antialiased else splats.opacities
         info = strategy_info(projected, opacities, camera)

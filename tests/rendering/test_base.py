@@ -2,9 +2,12 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 
 import pytest
+import scenes
+import torch
 
 from freqgs_plugin.functional import projection
 from freqgs_plugin.rendering import base
@@ -59,6 +62,38 @@ def test_registered_by_entry_point(monkeypatch):
     assert set(asked) == {"freqgs_plugin.rasterizers"}
     with pytest.raises(ValueError, match="auto, torch, numba, gsplat, custom"):
         get_rasterizer("other", "cpu")
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", scenes.LEAVES)
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_numbers_that_are_not_finite_are_named(backend, name, bad):
+    splats, camera = scenes.splats(dtype=torch.float32), scenes.camera(dtype=torch.float32)
+    values = getattr(splats, name).clone()
+    values.view(40, -1)[[7, 9], -1] = bad
+    with pytest.raises(
+        ValueError, match=rf"{name} of 2 of 40 Gaussians are not finite \(first: row 7, .*{bad}.*Remove"
+    ):
+        get_rasterizer(backend, "cpu")(scenes.replace(splats, **{name: values}), camera)
+
+
+def test_finite_numbers_whose_sum_overflows_pass():
+    splats = scenes.replace(scenes.splats(dtype=torch.float32), features=torch.full((40, 3), 3e38))
+    base.check_inputs(splats, scenes.camera())
+
+
+@pytest.mark.parametrize("change, message", [
+    ({"width": 0}, "camera is 0x29 px; both sides"),
+    ({"K": torch.diag(torch.tensor([0.0, 1.0, 1.0]))}, "focal lengths are 0 and 1 px; both must be > 0"),
+    ({"K": torch.diag(torch.tensor([-2.0, 1.0, 1.0]))}, "focal lengths are -2 and 1 px"),
+    ({"K": torch.full((3, 3), float("nan"))}, "the camera's K is not finite"),
+    ({"viewmat": torch.full((4, 4), float("inf"))}, "the camera's viewmat is not finite"),
+])  # fmt: skip
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_impossible_cameras_are_refused(backend, change, message):
+    splats, camera = scenes.splats(dtype=torch.float32), scenes.camera(dtype=torch.float32)
+    with pytest.raises(ValueError, match=message):
+        get_rasterizer(backend, "cpu")(splats, replace(camera, **change))
 
 
 def test_the_projections_constants_are_the_seams():
