@@ -179,13 +179,13 @@ def _distances(gaussians: Gaussians, camera: Camera) -> tuple[Float[Tensor, " n"
     # autocast would take these products at half precision
     with torch.autocast(means.device.type, enabled=False):
         viewmat, intrinsics = camera.viewmat.to(means), camera.K.to(means)
-        x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
+        x, y, z = torch.addmm(viewmat[:3, 3:], viewmat[:3, :3], means.T)
     front = z > NEAR_PLANE
     depth = torch.where(front, z, 1.0)
     u = x / depth * intrinsics[0, 0] + intrinsics[0, 2]
     v = y / depth * intrinsics[1, 1] + intrinsics[1, 2]
     inside = front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-    return torch.linalg.vector_norm(torch.stack([x, y, z], -1), dim=-1), inside
+    return torch.hypot(torch.hypot(x, y), z), inside
 
 
 def _frustum_distance(
