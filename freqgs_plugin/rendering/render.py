@@ -1,9 +1,10 @@
 """From Gaussians, a camera and an attenuation to a picture: the only path there is."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from freqgs_plugin.functional.attenuation import Attenuation
@@ -54,6 +55,7 @@ def render_prefixes(
     gaussians: Gaussians,
     camera: Camera,
     num_levels: int,
+    attenuation: Attenuation | None = None,
     *,
     rasterizer: Rasterizer,
     background: Float[Tensor, " 3"] | None = None,
@@ -62,20 +64,37 @@ def render_prefixes(
 ) -> list[Rendering]:
     """The pictures of the prefixes 1..num_levels, for training: every row stays (Eq. 5).
 
-    The last one's `info` describes all rows; see `PrefixRasterizer.prefixes` for what its `means2d` receives.
+    `attenuation` multiplies opacities. The last one's `info` describes all rows; see `PrefixRasterizer.prefixes` for
+    what its `means2d` receives. Rows of weight 0 have radius 0 there: they count as not seen. `info["drawn"]` counts
+    the others.
     """
     options = {"background": background, "antialiased": antialiased}
+    weight = None if attenuation is None else attenuation(gaussians, camera)
     renderings = _composite_prefixes(
-        shade(gaussians, camera), gaussians.level, num_levels, camera, rasterizer, statistics, options
+        shade(gaussians, camera, weight), gaussians.level, num_levels, camera, rasterizer, statistics, options
     )
     means2d = renderings[-1].info["means2d"]
     if means2d.requires_grad:
         means2d.retain_grad()
+    if weight is not None:
+        renderings[-1] = _without_hidden(renderings[-1], weight > 0)
     return renderings
 
 
+def _without_hidden(rendering: Rendering, shown: Bool[Tensor, " n"]) -> Rendering:
+    info = rendering.info
+    radii = torch.where(shown, info["radii"], 0)
+    return replace(rendering, info={**info, "radii": radii, "drawn": int(shown.sum())})
+
+
 def rendered_weight(
-    gaussians: Gaussians, camera: Camera, num_levels: int, *, rasterizer: Rasterizer, antialiased: bool = True
+    gaussians: Gaussians,
+    camera: Camera,
+    num_levels: int,
+    attenuation: Attenuation | None = None,
+    *,
+    rasterizer: Rasterizer,
+    antialiased: bool = True,
 ) -> Float[Tensor, " n"]:
     """How much of the picture each Gaussian makes up: its weight in front-to-back compositing, summed over pixels.
 
@@ -83,11 +102,12 @@ def rendered_weight(
     counts: the gradient of a picture of ones with respect to a feature of each Gaussian is just this sum.
     """
     probe = torch.zeros(len(gaussians), 1, device=gaussians.means.device, requires_grad=True)
+    weight = 1.0 if attenuation is None else attenuation(gaussians, camera).detach()
     splats = Splats(
         gaussians.means.detach(),
         gaussians.quats.detach(),
         gaussians.scales.detach(),
-        gaussians.opacities.detach(),
+        gaussians.opacities.detach() * weight,
         probe,
     )
     with torch.enable_grad():

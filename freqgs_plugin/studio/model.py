@@ -1,274 +1,191 @@
-"""The base of both methods: splatfacto with a swappable rasterizer, level tags, a guard and restartable training."""
+"""The base of both methods: how splats are trained, with level tags, densification, a guard and exact resuming."""
 
 from collections.abc import Iterator
-from contextlib import nullcontext
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from nerfstudio.cameras.camera_optimizers import CameraOptimizer
+from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.model_components.lib_bilagrid import BilateralGrid
-from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel, SplatfactoModelConfig, get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from freqgs_plugin.functional.attenuation import Attenuation
-from freqgs_plugin.functional.image_loss import ssim
-from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
-from freqgs_plugin.rendering.render import render
+from freqgs_plugin.functional.image_loss import image_distance
+from freqgs_plugin.rendering.render import rendered_weight
 from freqgs_plugin.studio.cameras import to_camera
-from freqgs_plugin.studio.controls import Stopwatch, drawn_text, in_viewer, uninterrupted
-from freqgs_plugin.studio.lpips import lpips_if_available
+from freqgs_plugin.studio.config import FreqSplatModelConfig
 from freqgs_plugin.studio.optimizers import adopt_parameters, scale_schedulers
-from freqgs_plugin.studio.outputs import LazyOutputs
+from freqgs_plugin.studio.targets import TargetCache, ViewTarget
+from freqgs_plugin.studio.viewing import SplatViews, psnr, show
+from freqgs_plugin.training.densify import LevelStrategy
 from freqgs_plugin.training.guard import FiniteGuard, NonFiniteError
-from freqgs_plugin.training.initialise import initial_parameters, random_points
-from freqgs_plugin.training.schedule import REFERENCE_STEPS
+from freqgs_plugin.training.schedule import REFERENCE_STEPS, Schedule, scaled
 from freqgs_plugin.types import Camera, Gaussians, Rendering
 
-GROUPS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
+__all__ = ["FreqSplatModel", "FreqSplatModelConfig"]
+
 _STATISTICS = ("grad2d", "count", "radii")
 
 
-class uncached_property(cached_property):
-    """A property that nerfstudio's viewer does not read while it looks for controls (it skips cached properties)."""
+class FreqSplatModel(SplatViews):
+    """Steps, densification, targets, losses and checkpoints.
 
-    def __get__(self, instance: Any, owner: Any = None) -> Any:
-        return self if instance is None else self.func(instance)
-
-
-@dataclass
-class FreqSplatModelConfig(SplatfactoModelConfig):
-    """Fields that both methods share, beside splatfacto's own."""
-
-    _target: type = field(default_factory=lambda: FreqSplatModel)
-    rasterizer: str = "auto"
-    """auto (gsplat on CUDA, numba on the CPU, torch elsewhere), torch, numba, gsplat, or one added by entry point"""
-    rasterize_mode: Literal["classic", "antialiased"] = "antialiased"
-    """antialiased: opacity compensation of Mip-Splatting (the paper's setting); classic: none"""
-    steps_scale: float | None = None
-    """step constants are multiplied by this; None: max_num_iterations / 30000"""
-    least_refine_interval: int = 100
-    """refinement is never more frequent than this, in steps, however short the run (ours)"""
-    stop_reset_before_end: int = 5000
-    """opacity resets stop this many steps before refinement does (ours)"""
-    max_gaussians: int = 0
-    """densification stops at this many Gaussians; 0: no bound (ours)"""
-    bad_steps_patience: int = 10
-    """training stops after this many steps in a row with losses or gradients that are not finite (ours)"""
-    seed: int = 42
-    """of the initial rotations, and of random initial points"""
-
-
-class FreqSplatModel(SplatfactoModel):
-    """Splatfacto whose pictures come from `rendering.render`, on any device.
-
-    Subclasses define `_make_strategy`, the attenuation that the viewer's controls ask for, and the training outputs.
+    Subclasses draw the training pictures and define the objective; what is to happen when can be added to.
     """
 
-    config: FreqSplatModelConfig
+    method = ""
+    """name of the method, for messages"""
 
     def populate_modules(self) -> None:
-        self._check_config()
-        generator = torch.Generator().manual_seed(self.config.seed)
-        if self.seed_points is not None and not self.config.random_init and len(self.seed_points[0]):
-            points, colours = self.seed_points[0], self.seed_points[1] / 255.0
-            if len(colours) != len(points):
-                colours = torch.full_like(points, 0.5)
-        else:
-            points, colours = random_points(self.config.num_random, self.config.random_scale, generator)
-            CONSOLE.log(
-                f"No seed points in use: {len(points)} random ones in a cube of side {self.config.random_scale}."
-            )
-        self.gauss_params = torch.nn.ParameterDict(
-            initial_parameters(points, colours, self.config.sh_degree, generator)
-        )
-        self.register_buffer("level", torch.ones(len(points), dtype=torch.int32))
-        self.camera_optimizer: CameraOptimizer = self.config.camera_optimizer.setup(
-            num_cameras=self.num_train_data, device="cpu"
-        )
-        if self.config.use_bilateral_grid:
-            x, y, w = self.config.grid_shape
-            self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
-        from torchmetrics.image import PeakSignalNoiseRatio
-
-        self.psnr = PeakSignalNoiseRatio(data_range=1.0)
-        random = self.config.background_color == "random"
-        # splatfacto's: the viewer's default background stands in for random ones
-        self.background_color = (
-            torch.tensor([0.1490, 0.1647, 0.2157]) if random else get_color(self.config.background_color)
-        )
-        self.crop_box = None
-        self.step = 0
+        super().populate_modules()
         self.guard = FiniteGuard(self.config.bad_steps_patience)
-        self.drawn = drawn_text()
-        self._sh_degree = 0
         self._scale = 1.0
         self._info: dict[str, Any] | None = None
         self._step_is_finite = True
-        self._rasterizer: Rasterizer | None = None
+        self._targets = TargetCache(self.config.target_cache_mb)
         self.strategy = self._make_strategy()
         self.strategy_state: dict[str, Any] = {"scene_scale": 1.0, **dict.fromkeys(_STATISTICS)}
 
+    def _check_config(self) -> None:
+        super()._check_config()
+        if self.config.strategy != "default":
+            raise ValueError(
+                f"strategy '{self.config.strategy}' does not work with {self.method}: MCMC moves Gaussians between "
+                "places and overwrites the state in which level tags travel. Use the default strategy."
+            )
+
+    def get_gaussian_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        return {name: [parameter] for name, parameter in self.gauss_params.items()}
+
     # -- what a method defines ------------------------------------------------------------------------------------
 
-    def _check_config(self) -> None:
-        """Raise ValueError where settings contradict each other."""
-        if self.config.sh_degree not in range(5):
-            raise ValueError(f"sh_degree is {self.config.sh_degree}; it must be in 0..4.")
-        if self.config.rasterize_mode not in ("antialiased", "classic"):
-            raise ValueError(f"rasterize_mode is '{self.config.rasterize_mode}'; choose antialiased or classic.")
-
-    def _make_strategy(self) -> Any:
+    def _training_renderings(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> list[Rendering]:
+        """The pictures that the objective compares; the last is the full one, whose `info` densification reads."""
         raise NotImplementedError
+
+    def _objective(self, outputs: dict[str, Any], target: ViewTarget) -> dict[str, Tensor]:
+        """Weighted parts of the loss."""
+        raise NotImplementedError
+
+    def _gradient_weights(self) -> Float[Tensor, " n"] | None:
+        """What each Gaussian's 2D gradient is divided by before it is compared with the densification threshold."""
+        return None
+
+    def _needs_magnitudes(self) -> bool:
+        """Whether the objective compares DFT magnitudes."""
+        return False
+
+    def _adapt_to_images(self, height: int, width: int) -> None:
+        """Before a new run: the smallest training image has this size, px."""
 
     def _begin_step(self, step: int) -> None:
         """Before a training step: what the schedule brings."""
-        raise NotImplementedError
+        self._sh_degree = self.schedule.sh_degree(step, self.config.sh_degree)
 
-    def _densify(self, step: int) -> None:
-        """After a training step with finite gradients."""
-        raise NotImplementedError
+    def _remove_unneeded(self, step: int) -> dict[str, int]:
+        """Before refinement: remove Gaussians that nobody needs. Returns what was removed, and how many."""
+        dropped = self._drop_unneeded() if self.schedule.drops_unneeded(step) else 0
+        return {"dropped (hardly seen)": dropped} if dropped else {}
 
-    def _training_outputs(self, camera: Camera, background: Tensor, cam_idx: int | None) -> dict[str, Any]:
-        raise NotImplementedError
-
-    def _viewer_attenuation(self) -> Attenuation | None:
-        """What the viewer's controls ask for."""
-        return None
-
-    def _more_outputs(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> dict[str, Any]:
-        """Further named outputs, as functions."""
-        return {}
+    def _census(self) -> str:
+        """What is logged with the number of Gaussians."""
+        return ""
 
     def _halvings(self) -> int:
-        """How often training images are halved at this step."""
-        return 0
+        """How often training images are halved at this step: splatfacto's resolution schedule."""
+        interval = scaled(self.config.resolution_schedule, self._scale)
+        return max(self.config.num_downscales - self.step // interval, 0)
 
-    # -- Gaussians and pictures -----------------------------------------------------------------------------------
+    # -- schedule -------------------------------------------------------------------------------------------------
 
-    @property
-    def antialiased(self) -> bool:
-        return self.config.rasterize_mode == "antialiased"
-
-    def gaussians(self) -> Gaussians:
-        """The scene with activated parameters: where exp and sigmoid are, and nowhere else."""
-        rest = self.features_rest[:, : (self._sh_degree + 1) ** 2 - 1]
-        return Gaussians(
-            means=self.means,
-            quats=self.quats,
-            scales=torch.exp(self.scales),
-            opacities=torch.sigmoid(self.opacities).squeeze(-1),
-            sh=torch.cat([self.features_dc[:, None], rest], 1),
-            level=self.level,  # pyright: ignore[reportArgumentType]
-            signed_residuals=self._signed(),
+    def _make_schedule(self) -> Schedule:
+        """The schedule of this run, `_scale` being known."""
+        config, s = self.config, self._scale
+        refine = scaled(config.refine_every, s, config.least_refine_interval)
+        stop = scaled(config.stop_split_at, s)
+        reset = max(scaled(config.reset_alpha_every * config.refine_every, s), 2 * refine)
+        return Schedule(
+            num_levels=1,
+            level_interval=1,
+            refine_every=refine,
+            refine_start=scaled(config.warmup_length, s),
+            refine_stop=stop,
+            refine_pause=0,
+            reset_every=reset,
+            # after a reset every view is seen once; with thousands of views that must not end densification
+            reset_pause=min(self.num_train_data + refine, reset // 2),
+            reset_stop=stop - scaled(config.stop_reset_before_end, s),
+            screen_size_stop=scaled(config.stop_screen_size_at, s),
+            sh_interval=scaled(config.sh_degree_interval, s),
+            multiresolution=False,
         )
 
-    def _signed(self) -> bool:
-        return False
-
-    def rasterizer(self) -> Rasterizer:
-        """The configured rasterizer, loaded on first use."""
-        if self._rasterizer is None:
-            self._rasterizer = get_rasterizer(self.config.rasterizer, self.device, absgrad=self.config.use_absgrad)
-        return self._rasterizer
-
-    def draw(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        background: Tensor,
-        attenuation: Attenuation | None = None,
-        depth: bool = False,
-    ) -> Rendering:
-        """A picture as the viewer, ns-eval and ns-render show it (not clamped)."""
-        return render(
-            gaussians,
-            camera,
-            attenuation,
-            rasterizer=self.rasterizer(),
-            background=background,
-            antialiased=self.antialiased,
-            depth=depth,
+    def _make_strategy(self) -> LevelStrategy:
+        config = self.config
+        return LevelStrategy(
+            prune_opa=config.cull_alpha_thresh,
+            lower_prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            grow_scale2d=config.split_screen_size,
+            prune_scale3d=config.cull_scale_thresh,
+            prune_scale2d=config.cull_screen_size,
+            absgrad=config.use_absgrad,
+            max_gaussians=config.max_gaussians,
         )
-
-    def get_outputs(self, camera: Cameras) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if not isinstance(camera, Cameras):
-            raise TypeError(f"a splat model renders nerfstudio Cameras, not {type(camera).__name__}.")
-        background = self._get_background_color()
-        if self.training:
-            pose = self.camera_optimizer.apply_to_camera(camera)
-            index = (camera.metadata or {}).get("cam_idx")
-            return self._training_outputs(to_camera(camera, pose, halvings=self._halvings()), background, index)
-        return self._view_outputs(to_camera(camera), background)
-
-    @torch.no_grad()
-    def _view_outputs(self, camera: Camera, background: Tensor) -> dict[str, Any]:
-        gaussians = self.gaussians()
-        if self.crop_box is not None:
-            gaussians = gaussians.select(self.crop_box.within(gaussians.means).flatten())
-        viewer = in_viewer()
-        attenuation = self._viewer_attenuation() if viewer else None
-        # the first picture imports and compiles
-        finish = uninterrupted() if self._rasterizer is None else nullcontext()
-        with Stopwatch(self.device) as watch, finish:
-            rendering = self.draw(gaussians, camera, background, attenuation, depth=True)
-        if viewer:
-            self.drawn.value = f"{rendering.info['drawn']:,} / {self.num_points:,}, {watch.milliseconds:.0f} ms"
-        depth = torch.where(rendering.alpha > 0, rendering.depth, rendering.depth.max())
-        ready = {
-            "rgb": show(rendering.features),
-            "depth": depth,
-            "accumulation": rendering.alpha,
-            "background": background.expand(camera.height, camera.width, 3),
-        }
-        return LazyOutputs(ready, self._more_outputs(gaussians, camera, background))
-
-    # -- training -------------------------------------------------------------------------------------------------
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:  # pyright: ignore
         trainer, optimizers = attributes.trainer, attributes.optimizers
-        assert trainer is not None and optimizers is not None
+        assert trainer is not None and optimizers is not None and attributes.pipeline is not None
+        cameras = attributes.pipeline.datamanager.train_dataset.cameras  # pyright: ignore
         resumed = self.step > 0
         if not resumed:
             steps = trainer.config.max_num_iterations
             self._scale = self.config.steps_scale or steps / REFERENCE_STEPS
-            assert attributes.pipeline is not None
-            cameras = attributes.pipeline.datamanager.train_dataset.cameras  # pyright: ignore
             self._adapt_to_images(int(cameras.height.min()), int(cameras.width.min()))
-        self._set_up_schedule()
+        self.schedule = self._make_schedule()
+        self.strategy.reset_every = self.schedule.reset_every
+        self.strategy.refine_scale2d_stop_iter = self.schedule.screen_size_stop
         CONSOLE.log(f"Step constants are multiplied by {self._scale:g}.")
         adopt_parameters(optimizers, self.get_param_groups())
         scale_schedulers(optimizers, self._scale)
-        for name in GROUPS:
+        for name in self.gauss_params:
             optimizers.optimizers[name].register_step_pre_hook(lambda *_: self._check_gradients(trainer))
         self._optimizers = optimizers
-        self._all_train_cameras = attributes.pipeline.datamanager.train_dataset.cameras  # pyright: ignore
+        self._all_train_cameras = cameras
         return [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self._before_step),
             TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._after_step),
         ]
 
-    def _adapt_to_images(self, height: int, width: int) -> None:
-        """Before a new run: the smallest training image has this size, px."""
-
-    def _train_cameras(self) -> Iterator[Cameras]:
+    def _train_cameras(self, halvings: int = 0) -> Iterator[Camera]:
         """The training views' cameras, one by one."""
         for index in range(len(self._all_train_cameras)):
-            yield self._all_train_cameras[index : index + 1]
+            camera: Cameras = self._all_train_cameras[index : index + 1]
+            yield to_camera(camera.to(self.device), halvings=halvings)
 
-    def _set_up_schedule(self) -> None:
-        """Build the schedule of this run, `_scale` being known."""
-        raise NotImplementedError
+    # -- a step ---------------------------------------------------------------------------------------------------
 
     def _before_step(self, step: int) -> None:
         self.step = step
         self._checked = False
         self._step_is_finite = True
         self._begin_step(step)
+
+    def _training_outputs(self, camera: Camera, background: Tensor, cam_idx: int | None) -> dict[str, Any]:
+        renderings = self._training_renderings(self.gaussians(), camera, background)
+        self._info = renderings[-1].info
+        images = [r.features for r in renderings]
+        if self.config.use_bilateral_grid and cam_idx is not None:
+            height, width = camera.height, camera.width
+            images = [self._apply_bilateral_grid(i[None], cam_idx, height, width).squeeze(0) for i in images]
+        return {
+            "rgb": show(images[-1].detach()),
+            "prefixes": images,
+            "accumulation": renderings[-1].alpha,
+            "background": background,
+            "info": self._info,
+        }
 
     def _check_gradients(self, trainer: Any) -> None:
         """Before the first optimizer of a step moves: drop the step's gradients if any is not finite."""
@@ -290,6 +207,108 @@ class FreqSplatModel(SplatfactoModel):
         if self._step_is_finite and self._info is not None:
             self._densify(step)
         self._info = None
+
+    # -- densification --------------------------------------------------------------------------------------------
+
+    def _lent_levels(self) -> "_LentLevels":
+        return _LentLevels(self)
+
+    def _densify(self, step: int) -> None:
+        """After a training step with finite gradients."""
+        assert self._info is not None
+        self.strategy.observe(self.strategy_state, self._info, self._gradient_weights())
+        removed = self._remove_unneeded(step)
+        with self._lent_levels() as state:
+            done = self.strategy.step(self.gauss_params, self._optimizers.optimizers, state, step, self.schedule)
+        done.update(removed)
+        if done:
+            what = ", ".join(f"{count:,} {name}" for name, count in done.items())
+            CONSOLE.log(f"Step {step}: {what}; now {self.num_points:,} Gaussians{self._census()}.")
+
+    def _drop_unneeded(self) -> int:
+        """Remove Gaussians that the training views hardly show."""
+        config = self.config
+        if config.least_weight <= 0 and config.least_views <= 1:
+            return 0
+        gaussians, attenuation = self.gaussians(), self._attenuation()
+        weights = [
+            rendered_weight(
+                gaussians,
+                camera,
+                self.num_levels,
+                rasterizer=self.rasterizer(),
+                attenuation=attenuation,
+                antialiased=self.antialiased,
+            )
+            for camera in self._train_cameras(self._halvings())
+        ]
+        with self._lent_levels() as state:
+            return self.strategy.drop_unneeded(
+                self.gauss_params, self._optimizers.optimizers, state, weights, config.least_weight, config.least_views
+            )
+
+    # -- targets, losses, metrics ---------------------------------------------------------------------------------
+
+    def _halve(self, image: Tensor) -> Tensor:
+        """Image [h, w, c] at the size trained at, at least 1 px: means of 2^n x 2^n blocks, as splatfacto's."""
+        n = self._halvings()
+        if image.dtype == torch.uint8:
+            image = image.float() / 255.0
+        image = image.to(self.device)
+        if n == 0 or not self.training:
+            return image
+        block = [min(2**n, side) for side in image.shape[:2]]
+        return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1)[None], block)[0].permute(1, 2, 0).contiguous()
+
+    def _training_targets(self, batch: dict[str, Any], background: Tensor) -> ViewTarget:
+        image = batch["image"]
+        opaque = image.shape[-1] == 3
+        levels = self.num_levels
+
+        def make() -> tuple[Tensor, Tensor | None]:
+            mask = self._halve(batch["mask"].float()) if "mask" in batch else None
+            return self.composite_with_background(self._halve(image), background), mask
+
+        key = (int(batch["image_idx"]), levels, self._halvings()) if opaque and "image_idx" in batch else None
+        return self._targets.get(key, make, levels, dft=self._needs_magnitudes())
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
+        if self.training:
+            target = self._training_targets(batch, outputs["background"]).image
+        else:
+            target = self.composite_with_background(self._halve(batch["image"]), outputs["background"])
+        metrics: dict[str, Any] = {
+            "psnr": psnr(outputs["rgb"], target),
+            "gaussian_count": self.num_points,
+            "width": outputs["rgb"].shape[1],
+            "height": outputs["rgb"].shape[0],
+            "skipped_steps": self.guard.skipped,
+        }
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
+    ) -> dict[str, Any]:
+        if not self.training:
+            target = self.composite_with_background(self._halve(batch["image"]), outputs["background"])
+            pair = [i.permute(2, 0, 1)[None] for i in (outputs["rgb"], target)]
+            return {f"image_{self.num_levels}": image_distance(pair[0], pair[1], self.config.ssim_lambda)}
+        losses: dict[str, Any] = self._objective(outputs, self._training_targets(batch, outputs["background"]))
+        if self.config.use_scale_regularization and self.step % 10 == 0:
+            losses["scale_reg"] = self._scale_regularization()
+        self.camera_optimizer.get_loss_dict(losses)
+        if self.config.use_bilateral_grid:
+            from nerfstudio.model_components.lib_bilagrid import total_variation_loss
+
+            losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
+        self.guard.note_losses(losses)
+        return losses
+
+    def _scale_regularization(self) -> Float[Tensor, ""]:
+        """PhysGaussian's penalty on spikes, as splatfacto's."""
+        log_ratio = self.scales.amax(-1) - self.scales.amin(-1)
+        return 0.1 * (log_ratio.exp().clamp_min(self.config.max_gauss_ratio) - self.config.max_gauss_ratio).mean()
 
     # -- checkpoints ----------------------------------------------------------------------------------------------
 
@@ -316,43 +335,29 @@ class FreqSplatModel(SplatfactoModel):
                 "the checkpoint holds no levels: it was not made by this method. "
                 "Load it with the method that made it (see `method_name` in its config.yml)."
             )
+        prefix = "gauss_params."
+        groups = {key.removeprefix(prefix) for key in dict if key.startswith(prefix)}
+        if groups != set(self.gauss_params):
+            raise ValueError(
+                f"the checkpoint holds the parameters {', '.join(sorted(groups))}, this model has "
+                f"{', '.join(sorted(self.gauss_params))}: it was made by another method or with other settings. "
+                "Load it with the method and the settings of its config.yml."
+            )
         self.level = torch.zeros_like(dict["level"], device=self.device)
         self._rasterizer = None
         return super().load_state_dict(dict, **kwargs)
 
-    # -- evaluation and export ------------------------------------------------------------------------------------
 
-    def get_image_metrics_and_images(
-        self, outputs: dict[str, Any], batch: dict[str, Any]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        predicted = outputs["rgb"]
-        a, b = target.permute(2, 0, 1)[None], predicted.permute(2, 0, 1)[None]
-        metrics = {"psnr": float(self.psnr(b, a)), "ssim": float(ssim(b, a)), "gaussians": float(self.num_points)}
-        lpips = lpips_if_available(self.device)
-        metrics["lpips_computed"] = float(lpips is not None)
-        if lpips is not None:
-            metrics["lpips"] = float(lpips(b, a))
-        metrics.update(self._more_metrics(outputs, target))
-        return metrics, {"img": torch.cat([target, predicted], 1)}
+class _LentLevels:
+    """The strategy's state with the level tags in it, for the length of a block: they follow every operator."""
 
-    def _more_metrics(self, outputs: dict[str, Any], target: Tensor) -> dict[str, float]:
-        return {}
+    def __init__(self, model: FreqSplatModel):
+        self._model = model
 
-    def _refuse_export(self) -> None:
-        """Raise where the parameters are not what an ordinary 3DGS viewer would show."""
+    def __enter__(self) -> dict[str, Any]:
+        state = self._model.strategy_state
+        state["level"] = self._model.level
+        return state
 
-    @uncached_property
-    def shs_0(self) -> Tensor:
-        self._refuse_export()
-        return self.features_dc
-
-    @uncached_property
-    def colors(self) -> Tensor:
-        self._refuse_export()
-        return SH2RGB(self.features_dc)
-
-
-def show(image: Tensor) -> Tensor:
-    """Clamp to [0, 1]: what is shown or stored."""
-    return image.clamp(0.0, 1.0)
+    def __exit__(self, *_: object) -> None:
+        self._model.level = self._model.strategy_state.pop("level")

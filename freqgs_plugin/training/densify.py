@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import duplicate, remove
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from freqgs_plugin.training.schedule import Schedule
@@ -90,10 +90,7 @@ class LevelStrategy(DefaultStrategy):
             prune |= largest > self.prune_scale3d * state["scene_scale"]
             if step < self.refine_scale2d_stop_iter:
                 prune |= state["radii"] > self.prune_scale2d
-        self._keep_levels(prune, opacity, state["level"])
-        if bool(prune.any()):
-            remove(params=params, optimizers=optimizers, state=state, mask=prune)  # pyright: ignore
-        return int(prune.sum())
+        return self.remove(params, optimizers, state, prune, opacity)
 
     @torch.no_grad()
     def drop_unneeded(
@@ -116,7 +113,14 @@ class LevelStrategy(DefaultStrategy):
         drop |= ((stacked > 0.5).sum(0) < min(least_views, len(weights))) & (state["level"] > 1)
         if float(drop.float().mean()) > _MOST_DROPPED:
             return 0
-        self._keep_levels(drop, stacked.sum(0), state["level"])
+        return self.remove(params, optimizers, state, drop, stacked.sum(0))
+
+    @torch.no_grad()
+    def remove(
+        self, params: Any, optimizers: Any, state: dict[str, Any], drop: Bool[Tensor, " n"], worth: Float[Tensor, " n"]
+    ) -> int:
+        """Remove the rows in `drop`, but of each level keep the one of most `worth`. Returns how many went."""
+        self._keep_levels(drop, worth, state["level"])
         if bool(drop.any()):
             remove(params=params, optimizers=optimizers, state=state, mask=drop)
         return int(drop.sum())

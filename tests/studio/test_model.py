@@ -10,11 +10,11 @@ from PIL import Image
 from running import SIZE, advance, save
 from torch.optim.lr_scheduler import LambdaLR
 
-from freqgs_plugin.studio.model import GROUPS
 from freqgs_plugin.training.guard import NonFiniteError
 
 pytestmark = pytest.mark.slow
 
+GROUPS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
 SHORT = {"steps_scale": 0.004, "least_refine_interval": 4}
 """levels begin at steps 10 and 20"""
 
