@@ -26,18 +26,27 @@ def docstrings(config_class: type) -> dict[str, str]:
 
 
 def table() -> str:
-    """Markdown: one row per field that this package defines, with the default of `ns-train lapsplat`."""
-    from freqgs_plugin.studio.lapsplat import LapSplatModelConfig
-    from freqgs_plugin.studio.model import FreqSplatModelConfig
+    """Markdown: the fields that this package defines, those of each method and those of both, with their defaults."""
+    from freqgs_plugin.studio.config import FreqSplatModelConfig
+    from method_configs.clodsplat import clodsplat
     from method_configs.lapsplat import lapsplat
 
-    config = lapsplat.config.pipeline.model
-    meaning = {**docstrings(LapSplatModelConfig), **docstrings(FreqSplatModelConfig)}
-    assert meaning.keys() <= {f.name for f in fields(config)}
+    methods = {m.config.method_name: m.config.pipeline.model for m in (lapsplat, clodsplat)}
+    shared = docstrings(FreqSplatModelConfig)
+    parts = []
+    for name, config in methods.items():
+        parts.append(f"`{name}`:\n\n{_rows(docstrings(type(config)), [config])}")
+    parts.append(f"Both methods:\n\n{_rows(shared, list(methods.values()))}")
+    return "\n\n".join(parts)
+
+
+def _rows(meaning: dict[str, str], configs: list) -> str:
+    """A table; a default that differs between `configs` is given for each of them, in order."""
     rows = ["| option | default | meaning |", "| --- | --- | --- |"]
     for name, text in meaning.items():
-        cells = (f"`{name.replace('_', '-')}`", f"`{getattr(config, name)}`", text.replace("|", "\\|"))
-        rows.append(f"| {' | '.join(cells)} |")
+        assert all(name in {f.name for f in fields(config)} for config in configs)
+        defaults = dict.fromkeys(f"`{getattr(config, name)}`" for config in configs)
+        rows.append(f"| `{name.replace('_', '-')}` | {' / '.join(defaults)} | {text.replace('|', chr(92) + '|')} |")
     return "\n".join(rows)
 
 

@@ -60,7 +60,7 @@ def test_methods_are_specifications_by_their_name(entry):
 
 
 def test_registered_are_the_methods_that_train():
-    assert [e.name for e in OURS] == ["lapsplat"]
+    assert sorted(e.name for e in OURS) == ["clodsplat", "lapsplat"]
     assert [e.name for e in entry_points(group="console_scripts") if e.value.startswith("freqgs_plugin")] == ["freqgs"]
 
 
@@ -87,7 +87,7 @@ import nerfstudio.scripts.train
 alone = time.process_time() - start
 before = set(sys.modules)
 start = time.process_time()
-import method_configs.lapsplat
+import method_configs.clodsplat, method_configs.lapsplat
 added = time.process_time() - start
 heavy = ("kornia", "pycolmap", "skimage", "sklearn", "matplotlib.pyplot", "numba", "torchmetrics", "torchvision",
          "gsplat.cuda._backend")
@@ -101,13 +101,15 @@ print(added, alone)
 
 
 def test_every_config_field_has_a_docstring():
+    from freqgs_plugin.studio.clodsplat import ClodSplatModelConfig
+    from freqgs_plugin.studio.config import FreqSplatModelConfig
     from freqgs_plugin.studio.datamanager import SceneDatamanagerConfig
     from freqgs_plugin.studio.lapsplat import LapSplatModelConfig
-    from freqgs_plugin.studio.model import FreqSplatModelConfig
     from method_configs.optimizers import FusedAdamConfig
 
     described = {SceneDatamanagerConfig: {"cache_images_type"}}  # nerfstudio's own docstring holds
-    for config in (LapSplatModelConfig, FreqSplatModelConfig, SceneDatamanagerConfig, FusedAdamConfig):
+    ours = (LapSplatModelConfig, ClodSplatModelConfig, FreqSplatModelConfig, SceneDatamanagerConfig, FusedAdamConfig)
+    for config in ours:
         fields = options_table().docstrings(config)
         missing = [name for name, text in fields.items() if not text and name not in described.get(config, set())]
         assert fields and not missing, f"{config.__name__}: {missing}"
@@ -222,7 +224,7 @@ def test_a_wheel_works_by_itself(tmp_path):
     )
     one, other, *names = python(code, tmp_path, PYTHONPATH=str(site)).split(" ", 2)
     assert one.startswith(str(site)) and other.startswith(str(site))
-    assert names == ["['freqgs', 'lapsplat']"]
+    assert names == ["['clodsplat', 'freqgs', 'lapsplat']"]
 
 
 def test_the_rasterizer_of_the_documentation_works(tmp_path, monkeypatch):

@@ -51,6 +51,18 @@ def lod_slider(num_levels: int) -> ViewerSlider:
     )
 
 
+def detail_slider(largest: float) -> ViewerSlider:
+    """Slider over virtual distance scales 1..`largest`, at 1 to begin with."""
+    return ViewerSlider(
+        name="Detail scale",
+        default_value=1.0,
+        min_value=1.0,
+        max_value=float(largest),
+        step=0.05,
+        hint="Draws the scene as if seen from so many times as far: 1 is everything, more is fewer Gaussians.",
+    )
+
+
 class WrittenText(ViewerText):
     """Text that only the program writes.
 

@@ -15,6 +15,7 @@ from freqgs_plugin.studio.config import FreqSplatModelConfig
 from freqgs_plugin.studio.controls import level_cut, lod_slider
 from freqgs_plugin.studio.model import FreqSplatModel
 from freqgs_plugin.studio.optimizers import restart
+from freqgs_plugin.studio.outputs import LazyOutputs
 from freqgs_plugin.studio.targets import ViewTarget
 from freqgs_plugin.studio.viewing import psnr, show
 from freqgs_plugin.training.densify import Growth, LevelStrategy, add_level
@@ -212,7 +213,9 @@ class LapSplatModel(FreqSplatModel):
     def _viewer_attenuation(self) -> Attenuation | None:
         return level_cut(self.lod)
 
-    def _more_outputs(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> dict[str, Any]:
+    def _more_outputs(
+        self, gaussians: Gaussians, camera: Camera, background: Tensor, notes: dict[str, float]
+    ) -> dict[str, Any]:
         def prefix(k: int) -> Tensor:
             return self.draw(gaussians, camera, background, LevelCut(k)).features
 
@@ -232,7 +235,7 @@ class LapSplatModel(FreqSplatModel):
         outputs["levels"] = levels
         return outputs
 
-    def _more_metrics(self, outputs: dict[str, Any], target: Tensor) -> dict[str, float]:
+    def _more_metrics(self, outputs: LazyOutputs, target: Tensor) -> dict[str, float]:
         """PSNR of each prefix against the image reduced to its level (REDUCE^n, Eq. 9), and counts."""
         metrics = {}
         full = target.permute(2, 0, 1)[None]

@@ -12,9 +12,16 @@ class LazyOutputs(dict[str, Any]):
     The viewer lists all names and reads one. ns-render reads those it was asked for.
     """
 
-    def __init__(self, ready: Mapping[str, Any], later: Mapping[str, Callable[[], Any]]):
+    def __init__(
+        self,
+        ready: Mapping[str, Any],
+        later: Mapping[str, Callable[[], Any]],
+        notes: dict[str, float] | None = None,
+    ):
         super().__init__({**ready, **dict.fromkeys(later)})
         self._later = dict(later)
+        self.notes = {} if notes is None else notes
+        """numbers that outputs leave when they are computed"""
 
     def __getitem__(self, name: str) -> Any:
         if name in self._later:

@@ -98,11 +98,13 @@ class SplatViews(SplatfactoModel):
         """What the viewer's controls ask for."""
         return self._attenuation()
 
-    def _more_outputs(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> dict[str, Any]:
-        """Further named outputs, as functions."""
+    def _more_outputs(
+        self, gaussians: Gaussians, camera: Camera, background: Tensor, notes: dict[str, float]
+    ) -> dict[str, Any]:
+        """Further named outputs, as functions; these may leave numbers in `notes`."""
         return {}
 
-    def _more_metrics(self, outputs: dict[str, Any], target: Tensor) -> dict[str, float]:
+    def _more_metrics(self, outputs: LazyOutputs, target: Tensor) -> dict[str, float]:
         """Further numbers of an evaluated view."""
         return {}
 
@@ -206,12 +208,13 @@ class SplatViews(SplatfactoModel):
             "accumulation": rendering.alpha,
             "background": background.expand(camera.height, camera.width, 3),
         }
-        return LazyOutputs(ready, self._more_outputs(gaussians, camera, background))
+        notes: dict[str, float] = {}
+        return LazyOutputs(ready, self._more_outputs(gaussians, camera, background, notes), notes)
 
     # -- evaluation and export ------------------------------------------------------------------------------------
 
     def get_image_metrics_and_images(
-        self, outputs: dict[str, Any], batch: dict[str, Any]
+        self, outputs: LazyOutputs, batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
         predicted = outputs["rgb"]

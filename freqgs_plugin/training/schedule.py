@@ -67,7 +67,16 @@ class Schedule:
         """
         since_level = step - (self.stage(step) - 1) * self.level_interval
         settled = self.stage(step) == 1 or since_level >= self.refine_pause
-        return settled and ((0 < step < self.refine_stop and step % self.reset_every == 0) or step == self.refine_stop)
+        return settled and self.looks_at_views(step)
+
+    def looks_at_views(self, step: int) -> bool:
+        """Whether all training views are looked at: on steps of opacity resets until refinement ends, and then."""
+        return (0 < step < self.refine_stop and step % self.reset_every == 0) or step == self.refine_stop
+
+    def recovers(self, step: int) -> bool:
+        """Whether opacities recover from a reset: for `reset_pause` steps."""
+        last = self.last_reset(step)
+        return last > 0 and step - last <= self.reset_pause
 
     def resets(self, step: int) -> bool:
         """Whether opacities are reset at `step`."""

@@ -1,0 +1,321 @@
+"""`clodsplat`: opacities that fall with distance at a learned rate ("CLoD-GS: Continuous Level-of-Detail")."""
+
+import statistics
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from nerfstudio.utils.colormaps import apply_float_colormap
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from freqgs_plugin.functional.attenuation import DistanceDecay, Reference, frustum_distance, log_decay
+from freqgs_plugin.rendering.render import render_prefixes
+from freqgs_plugin.studio.config import FreqSplatModelConfig
+from freqgs_plugin.studio.controls import Stopwatch, detail_slider, in_viewer
+from freqgs_plugin.studio.model import FreqSplatModel
+from freqgs_plugin.studio.outputs import LazyOutputs
+from freqgs_plugin.studio.targets import ViewTarget
+from freqgs_plugin.studio.viewing import psnr, show, uncached_property
+from freqgs_plugin.training.detail import CountGradient, DetailSampling, count_loss
+from freqgs_plugin.training.objective import pyramid_objective
+from freqgs_plugin.training.schedule import scaled
+from freqgs_plugin.types import Camera, Gaussians, Rendering
+
+_FAINTEST = -60.0
+"""least ln(opacity) that is exported; viewers draw nothing under ln(1/255) = -5.5"""
+
+
+@dataclass
+class ClodSplatModelConfig(FreqSplatModelConfig):
+    """Fields of `clodsplat`. Step constants are for runs of 30,000 steps and scale with the run's length."""
+
+    _target: type = field(default_factory=lambda: ClodSplatModel)
+    use_decay: bool = True
+    """learn a distance decay for each Gaussian; off: splatfacto's algorithm, to compare with"""
+    decay_start_step: int = 5000
+    """step from which opacities decay with distance (the paper)"""
+    initial_decay: float = 5.0
+    """sigma of every Gaussian at first, in normalised distances (ours; the paper does not say)"""
+    largest_scale: float = 5.0
+    """s_max: training draws its virtual distance scale from U(1, s_max) (the paper: 1, 3, 5 or 7)"""
+    full_detail_every: int = 0
+    """every so many steps the scale is 1; 0: only by chance (the paper)"""
+    weigh_scales: bool = True
+    """steps at larger scales count less, by w_s of Eq. 5 (the paper)"""
+    reg_weight: float = 1.0
+    """lambda_reg of the loss on the number of drawn Gaussians (Eq. 5, the paper); 0 leaves it out"""
+    reg_gradient: CountGradient = "ste"
+    """gradient of that loss: none (the paper's formula has none), ste (counts exactly, gradient of a sigmoid; ours),
+    soft (sum of the sigmoids). ste and soft are divided by (s_max - 1)^2"""
+    densify_compensate: bool = True
+    """2D gradients are divided by w_s before densification looks at them (ours)"""
+    train_reference: Reference = "frustum_max"
+    """what distances are divided by in training: the largest in the frustum (the paper), their 0.99 quantile, or the
+    scene's own number"""
+    view_reference: Reference = "scene"
+    """the same for viewing, evaluation and export; scene does not jump when a far Gaussian comes into view (ours)"""
+    soft_cut: bool = True
+    """viewing fades Gaussians between 1 and 2 times the threshold, so that nothing pops (ours)"""
+    train_soft_cut: bool = False
+    """the same in training (the paper: no)"""
+    dead_decay: Literal["prune", "keep"] = "prune"
+    """Gaussians with sigma <= 0, which nothing brings back: removed, or kept alive by holding sigma at least_decay"""
+    least_decay: float = 0.25
+    """sigma is held at or above this where dead_decay is keep (ours)"""
+    detail_scales: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 5.0)
+    """scales that are evaluated, and offered as outputs detail_1, detail_1.5 ..."""
+    export_distance: float = 0.5
+    """ns-export writes opacities as seen from this normalised distance: a plain 3DGS scene cannot fade"""
+
+
+class ClodSplatModel(FreqSplatModel):
+    """Training looks at the scene from virtual distances; each Gaussian learns how soon it may fade."""
+
+    config: ClodSplatModelConfig
+    method = "clodsplat"
+
+    def _check_config(self) -> None:
+        super()._check_config()
+        config = self.config
+        if not 1 <= config.largest_scale < float("inf"):
+            raise ValueError(f"largest_scale is {config.largest_scale}; it must be a finite number >= 1.")
+        if not config.initial_decay > 0:
+            raise ValueError(f"initial_decay is {config.initial_decay}; it must be > 0, or nothing is ever drawn.")
+        if not config.least_decay > 0:
+            raise ValueError(f"least_decay is {config.least_decay}; it must be > 0.")
+        if any(not scale > 0 for scale in config.detail_scales):
+            raise ValueError(f"detail_scales are {config.detail_scales}; each must be > 0.")
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        self._decays = False
+        self._scene_distance = 1.0
+        self.detail = detail_slider(2 * max(self.config.largest_scale, 1.5))
+
+    def _initial_parameters(self) -> dict[str, torch.nn.Parameter]:
+        parameters = super()._initial_parameters()
+        if self.config.use_decay:
+            decay = torch.full((len(parameters["means"]), 1), self.config.initial_decay)
+            parameters["decay"] = torch.nn.Parameter(decay)
+        return parameters
+
+    # -- the scene ------------------------------------------------------------------------------------------------
+
+    def gaussians(self) -> Gaussians:
+        """The scene; with a decay once that has begun to act."""
+        gaussians = super().gaussians()
+        return replace(gaussians, decay=self.gauss_params["decay"].squeeze(-1)) if self._decays else gaussians
+
+    @property
+    def scene_distance(self) -> float:
+        """World units: the median over the training views of the largest distance in the frustum."""
+        return self._scene_distance
+
+    def attenuation(self, scale: float | int) -> DistanceDecay | None:
+        """How the scene is drawn at `scale`; None where it does not decay (yet)."""
+        config = self.config
+        if not self._decays:
+            return None
+        return DistanceDecay(float(scale), config.view_reference, self._scene_distance, config.soft_cut)
+
+    def _attenuation(self) -> DistanceDecay | None:
+        return self.attenuation(1.0)
+
+    def _viewer_attenuation(self) -> DistanceDecay | None:
+        return self.attenuation(float(self.detail.value))
+
+    # -- schedule and densification -------------------------------------------------------------------------------
+
+    def _begin_step(self, step: int) -> None:
+        super()._begin_step(step)
+        config = self.config
+        self._sampling = DetailSampling(
+            start=scaled(config.decay_start_step, self._scale, least=0),
+            largest=config.largest_scale,
+            seed=config.seed,
+            full_detail_every=config.full_detail_every,
+        )
+        decays = config.use_decay and self._sampling.active(step)
+        begins = decays and not self._decays
+        self._decays = decays
+        if begins or self.schedule.looks_at_views(step):
+            self._measure_scene()
+        if begins:
+            CONSOLE.log(f"Step {step}: opacities decay with distance from here on.")
+
+    @torch.no_grad()
+    def _measure_scene(self) -> None:
+        kind = "frustum_quantile" if self.config.train_reference == "frustum_quantile" else "frustum_max"
+        gaussians = self.gaussians()
+        measured = statistics.median(frustum_distance(gaussians, camera, kind) for camera in self._train_cameras())
+        if measured > 0:
+            self._scene_distance = measured
+
+    def _gradient_weights(self) -> Float[Tensor, " n"] | None:
+        assert self._info is not None
+        weight = self._info["loss_weight"]
+        if weight == 1 or not self.config.densify_compensate:
+            return None
+        return torch.full((self.num_points,), weight, device=self.device)
+
+    def _remove_unneeded(self, step: int) -> dict[str, int]:
+        removed = super()._remove_unneeded(step)
+        if not self._decays or step % self.schedule.refine_every:
+            return removed
+        if self.config.dead_decay == "prune":
+            dead = self._remove_dead(thoroughly=self.schedule.looks_at_views(step))
+            if dead:
+                removed["removed (dead decay)"] = dead
+        elif self.num_dead:
+            removed["held (dead decay)"] = self.num_dead
+        return removed
+
+    @torch.no_grad()
+    def _remove_dead(self, thoroughly: bool) -> int:
+        """Remove Gaussians with sigma <= 0 and, `thoroughly`, those that fade under the threshold in every view."""
+        gaussians = self.gaussians()
+        assert gaussians.decay is not None
+        dead = gaussians.decay <= 0
+        if thoroughly:
+            best, decay = torch.full_like(gaussians.opacities, -torch.inf), self._training_decay(1.0)
+            for camera in self._train_cameras():
+                best = torch.maximum(best, decay.margin(gaussians, camera))
+            dead |= best <= 0
+        with self._lent_levels() as state:
+            return self.strategy.remove(
+                self.gauss_params, self._optimizers.optimizers, state, dead, gaussians.decay.detach()
+            )
+
+    @property
+    def num_dead(self) -> int:
+        """Gaussians whose sigma is at or below 0, or at the bound that keeps them from it."""
+        bound = self.config.least_decay if self.config.dead_decay == "keep" else 0.0
+        return int((self.gauss_params["decay"] <= bound).sum()) if self._decays else 0
+
+    def _after_step(self, step: int) -> None:
+        if self._decays and self.config.dead_decay == "keep":
+            with torch.no_grad():
+                self.gauss_params["decay"].clamp_(min=self.config.least_decay)
+        super()._after_step(step)
+
+    # -- training -------------------------------------------------------------------------------------------------
+
+    def _training_decay(self, scale: float) -> DistanceDecay:
+        config = self.config
+        return DistanceDecay(scale, config.train_reference, self._scene_distance, config.train_soft_cut)
+
+    def _training_renderings(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> list[Rendering]:
+        decay, more = None, {"loss_weight": 1.0}
+        if self._decays:
+            decay = self._training_decay(self._sampling.scale(self.step, self.schedule.recovers(self.step)))
+            margin = decay.margin(gaussians, camera)
+            if not bool((margin > 0).any()):
+                # an empty picture teaches nothing
+                decay = self._training_decay(1.0)
+                margin = decay.margin(gaussians, camera)
+            weight = self._sampling.loss_weight(decay.scale) if self.config.weigh_scales else 1.0
+            more = {"loss_weight": weight, "scale": decay.scale, "margin": margin}
+        options = {"rasterizer": self.rasterizer(), "background": background, "antialiased": self.antialiased}
+        (rendering,) = render_prefixes(gaussians, camera, 1, decay, **options)
+        return [replace(rendering, info={**rendering.info, **more})]
+
+    def _objective(self, outputs: dict[str, Any], target: ViewTarget) -> dict[str, Tensor]:
+        config, info = self.config, outputs["info"]
+        losses = pyramid_objective(
+            outputs["prefixes"],
+            target.image,
+            ssim_weight=config.ssim_lambda,
+            image_weight=info["loss_weight"],
+            clamp_mode=config.clamp_in_loss,
+            mask=target.mask,
+            targets=target.pyramid,
+        )
+        if self._decays and config.reg_weight != 0:
+            regularizer = count_loss(info["margin"], info["scale"], config.largest_scale, config.reg_gradient)
+            losses["count"] = info["loss_weight"] * config.reg_weight * regularizer
+        return losses
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
+        metrics = super().get_metrics_dict(outputs, batch)
+        if self._decays:
+            metrics["decay_mean"] = self.gauss_params["decay"].detach().mean()
+            metrics["dead_decay"] = self.num_dead
+        if self._decays and self.training:
+            info = outputs["info"]
+            metrics["scale"] = info["scale"]
+            metrics["drawn_share"] = info["drawn"] / max(self.num_points, 1)
+        return metrics
+
+    # -- checkpoints ----------------------------------------------------------------------------------------------
+
+    def get_extra_state(self) -> dict[str, Any]:
+        return {**super().get_extra_state(), "decays": self._decays, "scene_distance": self._scene_distance}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        super().set_extra_state(state)
+        self._decays = bool(state["decays"])
+        self._scene_distance = float(state["scene_distance"])
+
+    # -- pictures, evaluation, export -----------------------------------------------------------------------------
+
+    def _more_outputs(
+        self, gaussians: Gaussians, camera: Camera, background: Tensor, notes: dict[str, float]
+    ) -> dict[str, Any]:
+        def detail(scale: float) -> Tensor:
+            with Stopwatch(self.device) as watch:
+                rendering = self.draw(gaussians, camera, background, self.attenuation(scale))
+            notes[f"gaussians_detail_{scale:g}"] = float(rendering.info["drawn"])
+            notes[f"milliseconds_detail_{scale:g}"] = watch.milliseconds
+            return show(rendering.features)
+
+        def drawn_share() -> Tensor:
+            scale = float(self.detail.value) if in_viewer() else self.config.largest_scale
+            less = self.attenuation(scale)
+            if less is None:
+                kept = torch.ones_like(gaussians.opacities)
+            else:
+                kept = (less(gaussians, camera) > 0).to(gaussians.opacities)
+            rendering = self.paint(gaussians, kept[:, None], camera, full())
+            return show(rendering.features / rendering.alpha.clamp_min(1e-6))
+
+        def decay() -> Tensor:
+            sigma = torch.ones_like(gaussians.opacities) if gaussians.decay is None else gaussians.decay.clamp_min(0.0)
+            initial = 1.0 if gaussians.decay is None else self.config.initial_decay
+            colours = apply_float_colormap((sigma / (sigma + initial))[:, None], "viridis")
+            return show(self.paint(gaussians, colours, camera, full()).features)
+
+        def full() -> Tensor | None:
+            attenuation = self._attenuation()
+            return None if attenuation is None else attenuation(gaussians, camera)
+
+        outputs: dict[str, Any] = {f"detail_{s:g}": lambda s=s: detail(s) for s in self.config.detail_scales}
+        return {**outputs, "drawn_share": drawn_share, "decay": decay}
+
+    def _more_metrics(self, outputs: LazyOutputs, target: Tensor) -> dict[str, float]:
+        """PSNR, Gaussians drawn and milliseconds at each of `detail_scales`."""
+        names = [f"detail_{scale:g}" for scale in self.config.detail_scales]
+        metrics = {f"psnr_{name}": float(psnr(outputs[name], target)) for name in names}
+        return {**metrics, **outputs.notes, "dead_decay": float(self.num_dead)}
+
+    @uncached_property
+    @torch.no_grad()
+    def opacities(self) -> Tensor:
+        """What ns-export writes: logits [n, 1] of the opacities seen from `export_distance`."""
+        raw = self.gauss_params["opacities"]
+        if not self._decays:
+            return raw
+        distance = torch.full((self.num_points,), self.config.export_distance, device=raw.device)
+        faded = log_decay(distance, self.gauss_params["decay"].squeeze(-1), 1.0)
+        log_opacity = torch.nn.functional.logsigmoid(raw.squeeze(-1)) + faded
+        # bounded, so that the logit is finite
+        return -torch.expm1(-log_opacity.clamp(_FAINTEST, -1e-7)).log()[:, None]
+
+    def _before_export(self) -> None:
+        if self._decays:
+            CONSOLE.log(
+                f"Exported opacities are those seen from {self.config.export_distance:g} of the scene's distance "
+                f"(`export_distance` in config.yml; {self._scene_distance:.3g} world units are 1): a plain 3DGS scene "
+                "cannot fade with distance."
+            )
