@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Literal
 
 
 def demo(
@@ -42,8 +43,31 @@ def demo(
     run_demo(DemoOptions(output_dir, scene, steps, levels), Console())
 
 
+def stability(
+    output_dir: Path = Path("stability-out"),
+    only: Literal["geometry", "compositing"] | None = None,
+    quick: bool = False,
+) -> None:
+    """Run a grid of extremes through every backend and dtype: value and gradient errors, finite or not, time.
+
+    Each case has one outcome that is right: a value, zero, or a named error. Writes stability.json and stability.md;
+    the exit status is 1 if any outcome is another one.
+
+    Args:
+        output_dir: folder for both files; groups that are not run keep what the files hold.
+        only: run one group of cases.
+        quick: leave out the cases that take long.
+    """
+    from rich.console import Console
+
+    from freqgs_plugin.reports.stability.runner import run_stability
+
+    run_stability(output_dir, only, quick, Console())
+
+
 COMMANDS = {
     "demo": demo,
+    "stability": stability,
 }
 """name on the command line -> function; its signature and docstring become the options and the help"""
 
@@ -69,8 +93,9 @@ def _expected(error: Exception) -> bool:
     """Errors raised for the user to read."""
     from freqgs_plugin.demo.training import TrainingError
     from freqgs_plugin.io.check_images import SceneError
+    from freqgs_plugin.reports.stability.runner import StabilityError
 
-    return isinstance(error, FileExistsError | TrainingError | SceneError)
+    return isinstance(error, FileExistsError | TrainingError | SceneError | StabilityError)
 
 
 if __name__ == "__main__":

@@ -88,15 +88,15 @@ def prefix_table(rows: Sequence[PrefixRow], title: str = "Prefixes of levels, he
 def write_report(path: Path, rows: Sequence[PrefixRow], **more: Any) -> dict[str, Any]:
     """Write rows, environment and whatever else is given as JSON, and return it. Infinite numbers become null."""
     report = {**environment(), **more, "prefixes": [asdict(row) for row in rows]}
-    text = json.dumps(_finite(report), indent=2, default=str, allow_nan=False)
+    text = json.dumps(finite_json(report), indent=2, default=str, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
     return report
 
 
-def _finite(value: Any) -> Any:
+def finite_json(value: Any) -> Any:
     """JSON has no infinity."""
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite_json(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,106 @@
+"""`freqgs stability`: runs the groups, saves each row at once and each finished group as JSON and Markdown."""
+
+import json
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from freqgs_plugin.reports.stability.case import Case, Group, Refused, Row
+from freqgs_plugin.reports.stability.measure import Evaluated, measure, truths
+from freqgs_plugin.reports.stability.suite import GROUPS, cases_of
+from freqgs_plugin.reports.stability.tables import markdown_page, rich_table
+from freqgs_plugin.reports.tables import finite_json
+from freqgs_plugin.reports.timing import environment
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+JSON, PAGE, ROWS = "stability.json", "stability.md", "stability-rows.jsonl"
+
+
+class StabilityError(RuntimeError):
+    """Some cases did not come out right; the message names them."""
+
+
+def run_stability(output_dir: Path, only: Group | None, quick: bool, console: "Console") -> None:
+    """Run the groups (or `only` one) and write `stability.json` and `stability.md`; groups that were not run stay.
+
+    Raises:
+        StabilityError: some outcome was not the expected one.
+        KeyboardInterrupt: passed on, after a message on what is saved.
+    """
+    output_dir.mkdir(parents=True, exist_ok=True)
+    rows_path = output_dir / ROWS
+    rows_path.unlink(missing_ok=True)
+    failed: list[Row] = []
+    for group in GROUPS if only is None else (only,):
+        with _told(group, output_dir, console):
+            rows, seconds = _run_group(group, quick, rows_path, console)
+        record = {**environment(), "quick": quick, "seconds": round(seconds, 1), "rows": [asdict(row) for row in rows]}
+        save_group(output_dir, group, record)
+        console.print(rich_table(group, rows))
+        failed += [row for row in rows if not row.passed]
+    rows_path.unlink(missing_ok=True)
+    for name, what in ((JSON, "all rows, with hardware and versions"), (PAGE, "the same as tables")):
+        console.print(f"{output_dir / name}: {what}", soft_wrap=True, highlight=False, markup=False)
+    if failed:
+        names = "; ".join(f"{row.group}: {row.case} ({row.backend} {row.dtype}: {row.outcome})" for row in failed)
+        raise StabilityError(f"{len(failed)} outcomes are not the expected ones: {names}")
+
+
+def save_group(output_dir: Path, group: Group, record: dict[str, Any]) -> None:
+    """Put a finished group into the JSON file and write the page anew, each in one step."""
+    path = output_dir / JSON
+    groups = json.loads(path.read_text(encoding="utf-8"))["groups"] if path.is_file() else {}
+    groups[group] = finite_json(record)
+    groups = {name: groups[name] for name in GROUPS if name in groups}
+    _replace(path, json.dumps({"groups": groups}, indent=1, allow_nan=False) + "\n")
+    _replace(output_dir / PAGE, markdown_page(groups))
+
+
+def _run_group(group: Group, quick: bool, rows_path: Path, console: "Console") -> tuple[list[Row], float]:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    start, rows = time.perf_counter(), []
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console) as bar, rows_path.open("a", encoding="utf-8") as file:
+        cases = cases_of(group, quick)
+        task = bar.add_task(group, total=len(cases))
+        for case in cases:
+            bar.update(task, description=case.id)
+            for row in _run_case(case):
+                rows.append(row)
+                file.write(json.dumps(finite_json(asdict(row))) + "\n")
+            file.flush()
+            bar.advance(task)
+        bar.update(task, description=group)
+    return rows, time.perf_counter() - start
+
+
+def _run_case(case: Case) -> Iterator[Row]:
+    answers: Sequence[Evaluated] = [] if isinstance(case.expected, Refused) else truths(case)
+    for setting in case.settings:
+        yield measure(case, setting, answers, repeats=1 if case.large else 3)
+
+
+@contextmanager
+def _told(group: Group, output_dir: Path, console: "Console") -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        console.print(
+            f"Stopped in group {group}. Rows so far are in {output_dir / ROWS}; {output_dir / JSON} holds whole groups "
+            f"only. To go on: freqgs stability --output-dir {output_dir} --only {group}",
+            soft_wrap=True, highlight=False, markup=False,
+        )  # fmt: skip
+        raise
+
+
+def _replace(path: Path, text: str) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, path)
