@@ -262,6 +262,6 @@ def _refuse_residuals(path: Path, raw: RawGaussians, signed: bool | None) -> Non
     )
     raise SplatFileError(
         f"{path} has {levels} levels, whose colours above level 1 are {how}: without their levels they would be drawn "
-        "as plain colours, wrongly. Start from a run with `--pipeline.model.signed-residuals False` or `--pipeline.model."
-        "num-levels 1`."
+        "as plain colours, wrongly. Start from a run with `--pipeline.model.signed-residuals False` or with "
+        "`--pipeline.model.num-levels 1`."
     )
