@@ -35,7 +35,8 @@ class Projected:
     means2d: Float[Tensor, "n 2"]
     """px, pixel centres at +0.5"""
     conics: Float[Tensor, "n 3"]
-    """a, b, c of the inverse covariance [[a, b], [b, c]] (with blur), px^-2"""
+    """a, b, c of the inverse covariance [[a, b], [b, c]] (with blur), px^-2; in float64 where the device has it, because
+    the gradient by a needle's length is a small difference of theirs"""
     depths: Float[Tensor, " n"]
     """camera z, world units"""
     cov_xx: Float[Tensor, " n"]
@@ -79,11 +80,11 @@ def project(
     cov = J R M M^T R^T J^T + blur I with M = rotation * scales, R the camera's rotation and J the Jacobian of the
     perspective division at the mean, held within `FOV_MARGIN` of the image (EWA splatting, Zwicker et al. 2001).
     `blur` is a variance, px^2. Rows that are culled get finite values and no gradient. The result has
-    the dtype of `means`.
+    the dtype of `means`, except for the conics.
     """
     dtype = means.dtype
     means, quats, scales, viewmat, intrinsics = (
-        t.to(means.device, _working_dtype(means)) for t in (means, quats, scales, camera.viewmat, camera.K)
+        t.to(means.device, working_dtype(means)) for t in (means, quats, scales, camera.viewmat, camera.K)
     )
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     point = means.unbind(-1)
@@ -111,7 +112,7 @@ def project(
     radii = _radii(means2d.detach(), cov_xx.detach(), cov_yy.detach(), det.detach(), drawable, camera)
     return Projected(
         means2d=means2d.to(dtype),
-        conics=conics.to(dtype),
+        conics=conics,
         depths=depths.to(dtype),
         cov_xx=cov_xx.detach().to(dtype),
         cov_yy=cov_yy.detach().to(dtype),
@@ -121,7 +122,7 @@ def project(
     )
 
 
-def _working_dtype(like: Tensor) -> torch.dtype:
+def working_dtype(like: Tensor) -> torch.dtype:
     """float64 where the device has it."""
     return torch.float32 if like.device.type == "mps" else torch.float64
 

@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from freqgs_plugin.functional.projection import Projected, project
 from freqgs_plugin.rendering.base import ALPHA_MIN, BLUR, check_inputs
-from freqgs_plugin.rendering.torch_compositing import backward_tiles, forward_tiles, splat_table
+from freqgs_plugin.rendering.torch_compositing import backward_tiles, conic_gradients, forward_tiles, splat_table
 from freqgs_plugin.rendering.torch_tiles import bin_splats
 from freqgs_plugin.types import Camera, Rendering, Splats
 
@@ -64,7 +64,7 @@ def strategy_info(projected: Projected, opacities: Float[Tensor, " n"], camera: 
         "means2d": projected.means2d[None],
         "radii": projected.radii[None],
         "depths": projected.depths[None],
-        "conics": projected.conics[None],
+        "conics": projected.conics.to(opacities)[None],
         "opacities": opacities[None],
         "width": camera.width,
         "height": camera.height,
@@ -104,14 +104,14 @@ class _Composite(torch.autograd.Function):
         grad = tiles.split(grad_features)
         behind = (grad * ctx.image).sum(1, keepdim=True) + transmittance * tiles.split(grad_transmittance)
         sums = backward_tiles(ctx.table, features, tiles, used, grad, behind[:, 0], ctx.absgrad)
-        s, sx, sy, sxx, sxy, syy = sums[:, d : d + 6].unbind(-1)
-        a, b, c = conics.unbind(-1)
+        moments = sums[:, d : d + 6]
+        v_means2d, v_conics = conic_gradients(moments, ctx.table)
         if ctx.absgrad:
             means2d.absgrad = sums[None, :, d + 6 :].contiguous()
         return (
-            torch.stack([a * sx + b * sy, b * sx + c * sy], dim=-1)[None],
-            torch.stack([-0.5 * sxx, -sxy, -0.5 * syy], dim=-1),
-            torch.where(opacities >= ALPHA_MIN, s / opacities.clamp_min(ALPHA_MIN), 0.0),
+            v_means2d.to(means2d)[None],
+            v_conics.to(conics),
+            torch.where(opacities >= ALPHA_MIN, moments[:, 0] / opacities.clamp_min(ALPHA_MIN), 0.0),
             sums[:, :d],
             *([None] * 5),
         )

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from freqgs_plugin.functional.projection import working_dtype
 from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from freqgs_plugin.rendering.torch_tiles import TILE, Tiles, chunks_by_length
 
@@ -38,14 +39,17 @@ def splat_table(
     opacities: Float[Tensor, " n"],
     cov_yy: Float[Tensor, " n"],
 ) -> Float[Tensor, "n+1 6"]:
-    """Per Gaussian: x, y, p, q, r, log opacity, with half the conic's form as (p dx + q dy)^2 + (r dy)^2.
+    """Per Gaussian: x, y, p, q, r, log opacity, with half the conic's form as u^2 + v^2, u = p dx + q dy, v = r dy.
 
     r^2 = 1 / (2 cov_yy) needs no difference of nearly equal numbers. The last row is inert.
     """
     a, b, _ = conics.unbind(-1)
+    # points without blur have no conic; they are not drawn
+    a, cov_yy = torch.where(a > 0, a, 1.0), torch.where(cov_yy > 0, cov_yy, 1.0)
     p = (a / 2).sqrt()
     log_opacity = torch.log(opacities.clamp_min(torch.finfo(opacities.dtype).tiny))
-    table = torch.stack([*means2d.unbind(-1), p, p * b / a, (0.5 / cov_yy).sqrt(), log_opacity], dim=-1)
+    frame = torch.stack([p, p * b / a, (0.5 / cov_yy).sqrt()], dim=-1).to(means2d)
+    table = torch.cat([means2d, frame, log_opacity[:, None]], dim=-1)
     inert = table.new_tensor([[0, 0, 0, 0, 0, INERT]])
     return torch.cat([table, inert])
 
@@ -82,8 +86,8 @@ class _Slab:
 
     rows: Int[Tensor, "s b k"]
     """rows of the Gaussians; the inert row behind a list's end"""
-    means: Float[Tensor, "s b k 2"]
-    """relative to the tile's middle, px"""
+    frames: Float[Tensor, "s b k 5"]
+    """p, q, r of `splat_table`, and u and v at the tile's middle"""
     coefficients: Float[Tensor, "s b k 6"]
     """of log alpha in `_basis`"""
     may_cap: bool
@@ -110,7 +114,9 @@ def _slab(
     coefficients = torch.stack(
         [log_opacity - u * u - v * v, -2 * p * u, -2 * (q * u + r * v), -p * p, -2 * p * q, -(q * q + r * r)], dim=-1
     )
-    return _Slab(rows, torch.stack([x, y], dim=-1), coefficients, bool(log_opacity.max() > math.log(ALPHA_MAX)))
+    return _Slab(
+        rows, torch.stack([p, q, r, u, v], dim=-1), coefficients, bool(log_opacity.max() > math.log(ALPHA_MAX))
+    )
 
 
 def _alpha(
@@ -189,9 +195,10 @@ def backward_tiles(
     behind: Float[Tensor, "t p"],
     absgrad: bool,
 ) -> Float[Tensor, "n s"]:
-    """Per Gaussian, summed over pixels: d feature gradients; the moments 1, dx, dy, dx^2, dx dy, dy^2 of S, where
-    S = alpha dL/dalpha and (dx, dy) = pixel - mean; with `absgrad` two absolute gradients by the 2D mean.
+    """Per Gaussian, summed over pixels: d feature gradients; the moments 1, u, v, u^2, uv, v^2 of S = alpha dL/dalpha
+    in the coordinates of `splat_table`; with `absgrad` two absolute gradients by the 2D mean.
 
+    In u and v a Gaussian is round: moments in pixels would lose those across a needle, whatever its length, in float32.
     `grad` is the image's gradient, `behind` its product with the image plus T_end dL/dT_end.
     """
     d, basis, scratch = features.shape[1], _basis(table), _Scratch(table)
@@ -214,7 +221,7 @@ def backward_tiles(
                 columns[step, ..., d : d + 6] = (share.view(-1, PIXELS) @ basis.T).view(*share.shape[:2], 6)
                 if absgrad:
                     columns[step, ..., d + 6 :] = _absolute(share, slab.coefficients[step], basis, scratch)
-            _centre_moments(columns[..., d : d + 6], slab.means)
+            columns[..., d : d + 6] = _round_moments(columns[..., d : d + 6], slab.frames)
             sums.index_add_(0, slab.rows.view(-1), columns.view(-1, sums.shape[1]))
     return sums[:-1]
 
@@ -240,16 +247,32 @@ def _shares(
     return (share if uncapped is None else share.mul_(uncapped)), rest
 
 
-def _centre_moments(moments: Float[Tensor, "s b k 6"], means: Float[Tensor, "s b k 2"]) -> None:
-    """Move moments 1, x, y, x^2, xy, y^2 from the tile's middle to the Gaussian's mean, in place."""
+def _round_moments(moments: Float[Tensor, "s b k 6"], frames: Float[Tensor, "s b k 5"]) -> Float[Tensor, "s b k 6"]:
+    """Moments 1, u, v, u^2, uv, v^2 from moments 1, x, y, x^2, xy, y^2 about the tile's middle."""
     m, mx, my, mxx, mxy, myy = moments.unbind(-1)
-    x, y = means.unbind(-1)
-    dx, dy = mx - x * m, my - y * m
-    mxx -= x * (mx + dx)
-    mxy -= x * my + y * dx
-    myy -= y * (my + dy)
-    mx.copy_(dx)
-    my.copy_(dy)
+    p, q, r, u, v = frames.unbind(-1)
+    pm, rm = p * mx + q * my, r * my
+    mu, mv = u * m + pm, v * m + rm
+    muu = u * (mu + pm) + p * p * mxx + 2 * p * q * mxy + q * q * myy
+    muv = u * mv + v * pm + r * (p * mxy + q * myy)
+    mvv = v * (mv + rm) + r * r * myy
+    return torch.stack([m, mu, mv, muu, muv, mvv], dim=-1)
+
+
+def conic_gradients(
+    moments: Float[Tensor, "n 6"], table: Float[Tensor, "m 6"]
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 3"]]:
+    """Gradients by 2D means and by conics a, b, c from the moments of `backward_tiles`, in float64 where there is one.
+
+    dx = (u - q / r v) / p and dy = v / r; by a, b, c the exponent's gradients are -dx^2 / 2, -dx dy, -dy^2 / 2.
+    """
+    working = working_dtype(moments)
+    _, su, sv, suu, suv, svv = moments.to(working).unbind(-1)
+    p, q, r = table[:-1, 2:5].to(working).unbind(-1)
+    syy = svv / (r * r)
+    sxy = (suv / r - q * syy) / p
+    sxx = (suu - 2 * q / r * suv + q * q * syy) / (p * p)
+    return torch.stack([2 * p * su, 2 * (q * su + r * sv)], -1), torch.stack([-0.5 * sxx, -sxy, -0.5 * syy], -1)
 
 
 def _absolute(

@@ -7,6 +7,7 @@ import torch
 from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN
 from freqgs_plugin.reports.stability.case import Case, Nothing, Value
 from freqgs_plugin.reports.stability.rendering import (
+    ON_THRESHOLD,
     Scene,
     camera,
     changed,
@@ -49,13 +50,13 @@ def _thresholds() -> list[Case]:
     """On a threshold both answers are right; a part in 1000 to either side only one is."""
     second_ends = _stack([0.99, 0.99, 0.5])  # transmittance 1e-2, then 1e-4
     return [
-        case("opacity on the threshold 1/255", partial(_facing_pixel, ALPHA_MIN), on_threshold=True),
+        case("opacity on the threshold 1/255", partial(_facing_pixel, ALPHA_MIN), shift=ON_THRESHOLD),
         case("opacity just above 1/255", partial(_facing_pixel, ALPHA_MIN * 1.001)),
         case("opacity just below 1/255", partial(_facing_pixel, ALPHA_MIN * 0.999), Nothing()),
-        case("opacity on the cap 0.999", partial(_facing_pixel, ALPHA_MAX), on_threshold=True),
+        case("opacity on the cap 0.999", partial(_facing_pixel, ALPHA_MAX), shift=ON_THRESHOLD),
         case("opacity just above the cap", partial(_facing_pixel, 0.9995), Value(gradient=1e-3)),
         case("opacity just below the cap", partial(_facing_pixel, 0.9985), Value(gradient=1e-3)),
-        case("transmittance on the threshold 1e-4", lambda: second_ends, Value(gradient=2e-3), on_threshold=True),
+        case("transmittance on the threshold 1e-4", lambda: second_ends, Value(gradient=2e-3), shift=ON_THRESHOLD),
     ]
 
 

@@ -7,6 +7,8 @@ import torch
 
 from freqgs_plugin.reports.stability.case import Case, Nothing, Refused, Value
 from freqgs_plugin.reports.stability.rendering import (
+    ON_THRESHOLD,
+    SETTINGS,
     Scene,
     both_filters,
     camera,
@@ -55,8 +57,28 @@ def _needles(ratio: float, *, thin: bool) -> Scene:
     return changed(splats(), scales=scales), camera()
 
 
+def _across(size: int, length: float, ratio: float) -> Scene:
+    """Needles of `length` in all directions of the image plane of a large image."""
+    gaussians = splats(seed=3)
+    angle = torch.arange(24).double() * (math.pi / 24)
+    zero = torch.zeros(24, dtype=torch.float64)
+    quats = torch.stack([torch.cos(angle / 2), zero, zero, torch.sin(angle / 2)], -1)
+    scales = torch.tensor([length, length / ratio, length / ratio]).double().expand(24, 3)
+    return changed(gaussians, quats=quats, scales=scales), camera(size, size, focal=float(size))
+
+
 def _anisotropy() -> list[Case]:
-    out = []
+    out = [
+        case(
+            f"needles across 400x400, length {length:g}, anisotropy {ratio:g}",
+            partial(_across, 400, length, ratio),
+            Value(value=1e-4, gradient=2e-4),
+            antialiased=False,
+            shift=1e-3,
+            settings=SETTINGS[:2],
+        )
+        for length, ratio in ((1.0, 1e3), (10.0, 1e3), (1e3, 1e8))
+    ]
     for power in (2, 4, 6, 8):
         tolerance = Value(value=1e-4, gradient=1e-3, exact_gradient=1e-5)
         thin, long = (partial(_needles, 10.0**power, thin=thin) for thin in (True, False))
@@ -98,7 +120,7 @@ def _places() -> list[Case]:
     tied[:, 2] = 3.0
     pixel = torch.tensor([0.02, 0.03, 3.0]).double() + 1e-3 * splats(200).means * torch.tensor([1.0, 1.0, 0.0])
     return [
-        case("on the near plane", partial(_at, near, 0.001), on_threshold=True),
+        case("on the near plane", partial(_at, near, 0.001), shift=ON_THRESHOLD),
         case("just in front of the near plane, small", partial(_at, (0.001, 0.002, 0.0101), 0.001)),
         case("just in front of the near plane, large", partial(_at, (0.001, 0.002, 0.0101), 10.0)),
         case("just in front of the near plane, aside", partial(_at, (0.02, 0.01, 0.0101), 0.02)),

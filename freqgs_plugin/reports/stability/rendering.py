@@ -20,7 +20,7 @@ SETTINGS = (
     *((Setting("gsplat", torch.float32),) if torch.cuda.is_available() else ()),
 )
 LEAVES = ("means", "quats", "scales", "opacities", "features")
-THRESHOLD_SHIFT = 1e-5
+ON_THRESHOLD = 1e-5
 """on a threshold, both sides are right for numbers within this relative distance: some 100 roundings of float32"""
 BACKGROUND = (0.3, -0.2, 0.9)
 
@@ -100,10 +100,14 @@ def rendering_case(
     *,
     antialiased: bool = True,
     blur: float = BLUR,
-    on_threshold: bool = False,
+    shift: float = 0.0,
     large: bool = False,
+    settings: tuple[Setting, ...] = SETTINGS,
 ) -> Case:
-    """The picture of a scene on a coloured background, with all its gradients."""
+    """The picture of a scene on a coloured background, with all its gradients.
+
+    `shift`: relative distance from a threshold (alpha, transmittance, near plane) within which both sides are right.
+    """
 
     def inputs() -> Tensors:
         gaussians, view = scene()
@@ -129,10 +133,9 @@ def rendering_case(
 
     def exact(leaves: Tensors) -> list[Tensors]:
         gaussians = Splats(*(leaves[key] for key in LEAVES))
-        shifts = (-THRESHOLD_SHIFT, THRESHOLD_SHIFT) if on_threshold else (0.0,)
         return [
-            dense(gaussians, view_of(leaves), leaves["background"], blur=blur, antialiased=antialiased, shift=shift)
-            for shift in shifts
+            dense(gaussians, view_of(leaves), leaves["background"], blur=blur, antialiased=antialiased, shift=side)
+            for side in ((0.0, -shift, shift) if shift else (0.0,))
         ]
 
     gaussians, view = scene() if not large else (None, None)
@@ -144,7 +147,7 @@ def rendering_case(
         compute=compute,
         truth=exact if small else None,
         expected=expected,
-        settings=SETTINGS,
+        settings=settings,
         units=_natural_units,
         fixed=frozenset({"viewmat", "K"}),
         large=large,
