@@ -41,7 +41,7 @@ class Fit:
     """What a budget allows in one view."""
 
     scale: float
-    """s_v, at least 1"""
+    """s_v"""
     drawn: int
     """Gaussians in view that are drawn at this scale"""
     note: str = ""
@@ -62,7 +62,7 @@ class LevelFit:
 
 @dataclass(frozen=True)
 class DecayBudget:
-    """`DistanceDecay` at the smallest scale of at least 1 that draws at most `count` Gaussians of a view.
+    """`DistanceDecay` at the smallest scale of at least `least` that draws at most `count` Gaussians of a view.
 
     Gaussians out of view have weight 0. See `decay_scale` for ties.
     """
@@ -73,14 +73,16 @@ class DecayBudget:
     """world units, for the reference `scene`"""
     soft: bool = True
     """as in `DistanceDecay`"""
+    least: float | int = 1.0
+    """the scale is never smaller: what a detail slider asks for"""
 
     def __post_init__(self) -> None:
         _whole(self.count)
-        DistanceDecay(1.0, self.reference, self.scene_distance)
+        DistanceDecay(self.least, self.reference, self.scene_distance)
 
     def fit(self, gaussians: Gaussians, camera: Camera) -> Fit:
         """The scale for one view."""
-        return decay_scale(gaussians, camera, self.count, self.reference, self.scene_distance)
+        return decay_scale(gaussians, camera, self.count, self.reference, self.scene_distance, self.least)
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
         scale = self.fit(gaussians, camera).scale
@@ -156,27 +158,32 @@ def decay_scale(
     count: float | int,
     reference: Reference = "scene",
     scene_distance: float | int | None = None,
+    least: float | int = 1.0,
 ) -> Fit:
     """The scale s_v at which at most `count` Gaussians in view are drawn: exactly `count`, apart from ties.
 
-    Never under 1, full detail: a budget above what that draws is met by 1. s_v falls as `count` grows. It lies between
-    the cut-offs of the last Gaussian that is drawn and the first that is not, in the middle where they are far enough
-    apart. Gaussians whose cut-offs agree to `TIE` are dropped together, and then fewer than `count` are drawn. Where
-    that would leave none, they are all drawn, and the note says so.
+    Never under `least` (1 is full detail): a budget above what that draws is met by it. s_v falls as `count` grows. It
+    lies between the cut-offs of the last Gaussian that is drawn and the first that is not, in the middle where they are
+    far enough apart. Gaussians whose cut-offs agree to `TIE` are dropped together, and then fewer than `count` are
+    drawn. Where that would leave none, they are all drawn, and the note says so.
 
     Raises:
-        ValueError: a count under 1 or not finite; Gaussians without decay; a reference without its distance.
+        ValueError: a count under 1 or not finite; Gaussians without decay; a reference without its distance; a scale
+            that is not positive.
     """
     count = _whole(count)
+    if not 0 < least < math.inf:
+        raise ValueError(f"the least scale is {least}; it must be a finite number > 0 (1 is the scene as trained).")
+    log_least = math.log(least)
     distance = normalised_distance(gaussians, camera, reference, scene_distance)
-    a, b = _exponents_above_1(gaussians, distance, in_view(gaussians, camera))
+    a, b = _exponents_above(gaussians, distance, in_view(gaussians, camera), log_least)
     if len(a) <= count:
-        return Fit(1.0, len(a))
-    kept, dropped = _two_cutoffs(a, b, count)
+        return Fit(float(least), len(a))
+    kept, dropped = _two_cutoffs(a, b, count, log_least)
     log_scale = max((kept + dropped) / 2, dropped + TIE)
     drawn = _count_above(a, b, log_scale)
     if drawn == 0:
-        log_scale = max(kept - TIE, 0.0)
+        log_scale = max(kept - TIE, log_least)
         drawn = _count_above(a, b, log_scale)
         return Fit(math.exp(log_scale), drawn, f"{drawn:,} Gaussians vanish at the same scale; fewer would be none.")
     return Fit(math.exp(log_scale), drawn)
@@ -232,17 +239,17 @@ def _exponents(
     return a, opacities.detach().double().log() - math.log(TAU)
 
 
-def _exponents_above_1(
-    gaussians: Gaussians, distance: Float[Tensor, " n"], seen: Bool[Tensor, " n"]
+def _exponents_above(
+    gaussians: Gaussians, distance: Float[Tensor, " n"], seen: Bool[Tensor, " n"], log_scale: float
 ) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
-    """a and b of the Gaussians in view that scale 1 draws."""
+    """a and b of the Gaussians in view that are drawn at a scale."""
     decay = decay_of(gaussians)
     if _compiled(gaussians):
         from freqgs_plugin.functional import compiled_budget
 
-        return compiled_budget.exponents(gaussians.opacities, distance, decay, seen)
+        return compiled_budget.exponents(gaussians.opacities, distance, decay, seen, log_scale)
     a, b = _exponents(gaussians.opacities, distance, decay)
-    rows = seen & (b > a)
+    rows = seen & (torch.sub(b, a, alpha=math.exp(2 * log_scale)) > log_scale)
     return a[rows], b[rows]
 
 
@@ -268,12 +275,12 @@ def _count_above(a: Float[Tensor, " n"], b: Float[Tensor, " n"], log_scale: floa
     return int(torch.count_nonzero(torch.sub(b, a, alpha=math.exp(2 * log_scale)) > log_scale))
 
 
-def _two_cutoffs(a: Float[Tensor, " n"], b: Float[Tensor, " n"], count: int) -> tuple[float, float]:
-    """The `count`-th largest ln s* and the next one; all are above 0, and there are more than `count`.
+def _two_cutoffs(a: Float[Tensor, " n"], b: Float[Tensor, " n"], count: int, low: float) -> tuple[float, float]:
+    """The `count`-th largest ln s* and the next one; all are above `low`, and there are more than `count`.
 
     The range of scales is halved until few Gaussians are left in it, or until it is a tie; those are solved for.
     """
-    low, high = 0.0, float(b.max())
+    high = float(b.max())
     above_low, above_high = len(a), 0
     while above_low - above_high > _FEW and high - low > TIE:
         middle = (low + high) / 2

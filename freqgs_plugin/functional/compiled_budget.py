@@ -37,14 +37,14 @@ def _in_view(means, scales, view, intrinsics, width, height, slack, out):
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def _exponents(opacities, distance, decay, seen, a, b):
-    log_tau, n = math.log(TAU), 0
+def _exponents(opacities, distance, decay, seen, log_scale, a, b):
+    log_tau, factor, n = math.log(TAU), math.exp(2 * log_scale), 0
     for i in range(len(seen)):
-        if seen[i] and opacities[i] > TAU:
+        if seen[i] and opacities[i] > 0:
             sigma, d = max(np.float64(decay[i]), 0.0), np.float64(distance[i])
             a[n] = d * d / (2 * sigma * sigma + EPSILON)
             b[n] = math.log(np.float64(opacities[i])) - log_tau
-            n += b[n] > a[n]
+            n += b[n] - a[n] * factor > log_scale
     return n
 
 
@@ -73,10 +73,12 @@ def in_view(gaussians: Gaussians, camera: Camera, slack: float) -> Tensor:
     return torch.from_numpy(seen)
 
 
-def exponents(opacities: Tensor, distance: Tensor, decay: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-    """`budget.exponents` of the rows in view whose cut-off is above 1, for float32 tensors on the CPU."""
+def exponents(
+    opacities: Tensor, distance: Tensor, decay: Tensor, seen: Tensor, log_scale: float
+) -> tuple[Tensor, Tensor]:
+    """ln s* as its equation, for the rows in view where it is above `log_scale`; float32 tensors on the CPU."""
     a, b = np.empty(len(seen) + 1), np.empty(len(seen) + 1)
-    n = _exponents(opacities.detach().numpy(), distance.numpy(), decay.detach().numpy(), seen.numpy(), a, b)
+    n = _exponents(opacities.detach().numpy(), distance.numpy(), decay.detach().numpy(), seen.numpy(), log_scale, a, b)
     return torch.from_numpy(a[:n]), torch.from_numpy(b[:n])
 
 

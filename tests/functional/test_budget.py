@@ -144,8 +144,8 @@ def test_compiled_and_torch_agree():
     assert torch.equal(in_view(scene, CAMERA), in_view(double, CAMERA))
     distance = normalised_distance(scene, CAMERA, "frustum_max")
     seen = in_view(scene, CAMERA)
-    single = budget._exponents_above_1(scene, distance, seen)
-    twice = budget._exponents_above_1(double, distance.double(), seen)
+    single = budget._exponents_above(scene, distance, seen, 0.3)
+    twice = budget._exponents_above(double, distance.double(), seen, 0.3)
     assert len(single[0]) > 1000
     for a, b in zip(single, twice, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-14, atol=1e-14)
@@ -192,6 +192,21 @@ def test_never_below_full_detail():
     full = drawn_at(scene, 1.0, reference="frustum_max")
     for count in (full, full + 1, 10**12):
         assert decay_scale(scene, CAMERA, count, "frustum_max") == budget.Fit(1.0, full)
+
+
+@pytest.mark.parametrize("least", [0.5, 2.0, 20.0])
+def test_a_slider_may_ask_for_less_than_the_budget_allows(least):
+    scene = gaussians()
+    options = {"reference": "frustum_max"}
+    at_least = drawn_at(scene, least, **options)
+    assert decay_scale(scene, CAMERA, at_least, "frustum_max", least=least) == budget.Fit(least, at_least)
+    fewer = decay_scale(scene, CAMERA, at_least - 5, "frustum_max", least=least)
+    assert fewer.scale > least and fewer.drawn == at_least - 5
+    weight = DecayBudget(10**6, "frustum_max", least=least)(scene, CAMERA)
+    assert int((weight > 0).sum()) == at_least
+    for bad in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match="scale is"):
+            decay_scale(scene, CAMERA, 5, "frustum_max", least=bad)
 
 
 def test_many_gaussians_take_the_same_path_to_the_same_scale():
