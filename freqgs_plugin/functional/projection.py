@@ -35,8 +35,8 @@ class Projected:
     means2d: Float[Tensor, "n 2"]
     """px, pixel centres at +0.5"""
     conics: Float[Tensor, "n 3"]
-    """a, b, c of the inverse covariance [[a, b], [b, c]] (with blur), px^-2; in float64 where the device has it, because
-    the gradient by a needle's length is a small difference of theirs"""
+    """a, b, c of the inverse covariance [[a, b], [b, c]] (with blur), px^-2; in float64 where the device has it: the
+    gradient by a needle's length is a small difference of theirs"""
     depths: Float[Tensor, " n"]
     """camera z, world units"""
     cov_xx: Float[Tensor, " n"]

@@ -154,14 +154,12 @@ def rendering_case(
     )
 
 
-def both_filters(
-    name: str, scene: Callable[[], Scene], group: Group, *expected: Value | Nothing, **more: bool
-) -> list[Case]:
+def both_filters(name: str, scene: Callable[[], Scene], group: Group, *expected: Value | Nothing) -> list[Case]:
     """The case without and with the antialiasing compensation; one outcome for each, or one for both."""
     classic, antialiased = expected * 2 if len(expected) == 1 else expected
     return [
-        rendering_case(group, name, scene, classic, antialiased=False, **more),
-        rendering_case(group, f"{name}, antialiased", scene, antialiased, antialiased=True, **more),
+        rendering_case(group, name, scene, classic, antialiased=False),
+        rendering_case(group, f"{name}, antialiased", scene, antialiased, antialiased=True),
     ]
 
 
