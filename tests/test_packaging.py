@@ -185,7 +185,7 @@ def test_links_and_pictures_are_there(page):
 
 
 def test_dependencies_are_what_is_imported():
-    names = {"cv2": "opencv-contrib-python-headless", "PIL": "pillow", "skimage": "scikit-image"}
+    names = {"cv2": "opencv-contrib-python-headless", "PIL": "pillow", "skimage": "scikit-image", "yaml": "pyyaml"}
     sources = [p for folder in ("freqgs_plugin", "method_configs") for p in (ROOT / folder).rglob("*.py")]
     pattern = re.compile(r"^\s*(?:import|from) (\w+)", flags=re.MULTILINE)
     modules = {m for p in sources for m in pattern.findall(re.sub(r'""".*?"""', "", p.read_text("utf-8"), flags=re.S))}

@@ -1,5 +1,6 @@
 """Viewer controls, and what they say about how to draw. They touch pictures in the viewer only, never training."""
 
+import math
 import sys
 import threading
 import time
@@ -8,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from nerfstudio.viewer.viewer_elements import ViewerSlider, ViewerText
+from nerfstudio.viewer.viewer_elements import ViewerNumber, ViewerSlider, ViewerText
 
 from freqgs_plugin.functional.attenuation import LevelCut
 
@@ -61,6 +62,21 @@ def detail_slider(largest: float) -> ViewerSlider:
         step=0.05,
         hint="Draws the scene as if seen from so many times as far: 1 is everything, more is fewer Gaussians.",
     )
+
+
+def budget_number() -> ViewerNumber:
+    """How many thousand Gaussians a view may have; 0: as many as it takes."""
+    return ViewerNumber(
+        name="Budget (thousands)",
+        default_value=0.0,
+        hint="Draws at most so many thousand Gaussians, those that show most; 0: no bound.",
+    )
+
+
+def budget_of(number: ViewerNumber) -> int | None:
+    """The Gaussians that the number allows, at least 1; None without a bound (0, less, or no number)."""
+    value = float(number.value)
+    return max(round(1000 * value), 1) if 0 < value < math.inf else None
 
 
 class WrittenText(ViewerText):

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from freqgs_plugin.functional.attenuation import Attenuation, LevelCut
+from freqgs_plugin.functional.attenuation import Attenuation, LevelCut, Product
 from freqgs_plugin.functional.pyramid import max_levels, reduce
 from freqgs_plugin.rendering.render import render_prefixes
 from freqgs_plugin.studio.config import FreqSplatModelConfig
@@ -211,7 +211,8 @@ class LapSplatModel(FreqSplatModel):
     # -- pictures, evaluation, export -----------------------------------------------------------------------------
 
     def _viewer_attenuation(self) -> Attenuation | None:
-        return level_cut(self.lod)
+        cut, budget = level_cut(self.lod), super()._viewer_attenuation()
+        return cut if budget is None else Product((cut, budget))
 
     def _more_outputs(
         self, gaussians: Gaussians, camera: Camera, background: Tensor, notes: dict[str, float]

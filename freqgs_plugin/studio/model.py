@@ -78,6 +78,9 @@ class FreqSplatModel(SplatViews):
     def _adapt_to_images(self, height: int, width: int) -> None:
         """Before a new run: the smallest training image has this size, px."""
 
+    def _begin_run(self, datamanager: Any) -> None:
+        """Before a new run: images and cameras are known."""
+
     def _begin_step(self, step: int) -> None:
         """Before a training step: what the schedule brings."""
         self._sh_degree = self.schedule.sh_degree(step, self.config.sh_degree)
@@ -143,6 +146,7 @@ class FreqSplatModel(SplatViews):
             steps = trainer.config.max_num_iterations
             self._scale = self.config.steps_scale or steps / REFERENCE_STEPS
             self._adapt_to_images(int(cameras.height.min()), int(cameras.width.min()))
+            self._begin_run(attributes.pipeline.datamanager)
         self.schedule = self._make_schedule()
         self.strategy.reset_every = self.schedule.reset_every
         self.strategy.refine_scale2d_stop_iter = self.schedule.screen_size_stop

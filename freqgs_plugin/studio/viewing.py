@@ -14,12 +14,13 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from freqgs_plugin.functional.attenuation import Attenuation
+from freqgs_plugin.functional.budget import LevelBudget
 from freqgs_plugin.functional.image_loss import ssim
 from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
 from freqgs_plugin.rendering.render import render
 from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.config import FreqSplatModelConfig
-from freqgs_plugin.studio.controls import Stopwatch, drawn_text, in_viewer, uninterrupted
+from freqgs_plugin.studio.controls import Stopwatch, budget_number, budget_of, drawn_text, in_viewer, uninterrupted
 from freqgs_plugin.studio.lpips import lpips_if_available
 from freqgs_plugin.studio.outputs import LazyOutputs
 from freqgs_plugin.training.initialise import initial_parameters, random_points
@@ -64,6 +65,7 @@ class SplatViews(SplatfactoModel):
         self.crop_box = None
         self.step = 0
         self.drawn = drawn_text()
+        self.budget = budget_number()
         self._sh_degree = 0
         self._rasterizer: Rasterizer | None = None
 
@@ -96,7 +98,8 @@ class SplatViews(SplatfactoModel):
 
     def _viewer_attenuation(self) -> Attenuation | None:
         """What the viewer's controls ask for."""
-        return self._attenuation()
+        count = budget_of(self.budget)
+        return self._attenuation() if count is None else LevelBudget(count)
 
     def _more_outputs(
         self, gaussians: Gaussians, camera: Camera, background: Tensor, notes: dict[str, float]

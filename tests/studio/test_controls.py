@@ -11,7 +11,17 @@ from nerfstudio.viewer.viewer_elements import ViewerElement
 from nerfstudio.viewer_legacy.server import viewer_utils
 from running import advance
 
-from freqgs_plugin.studio.controls import Stopwatch, in_viewer, level_cut, lod_slider, uninterrupted
+from freqgs_plugin.functional.budget import in_view
+from freqgs_plugin.studio.cameras import to_camera
+from freqgs_plugin.studio.controls import (
+    Stopwatch,
+    budget_number,
+    budget_of,
+    in_viewer,
+    level_cut,
+    lod_slider,
+    uninterrupted,
+)
 
 
 class RenderThread(RenderStateMachine):
@@ -84,13 +94,40 @@ def test_the_slider_acts_in_the_viewer_alone(trainer):
 
 
 @pytest.mark.slow
-def test_training_does_not_see_the_slider(trainer):
+def test_a_budget_bounds_what_the_viewer_draws(trainer):
+    model = trainer.pipeline.model
+    camera, _ = view(trainer)
+
+    def drawn():
+        picture = in_render_thread(lambda: model.get_outputs_for_camera(camera)["rgb"])
+        return int(model.drawn.value.split(" / ")[0].replace(",", "")), picture
+
+    with torch.no_grad():
+        everything, full = drawn()
+        seen = int(in_view(model.gaussians(), to_camera(camera)).sum())
+        model.budget.value = 1e6
+        assert drawn()[0] == seen <= everything
+        torch.testing.assert_close(drawn()[1], full)
+        for thousands in (0.05, 0.2):
+            model.budget.value = thousands
+            assert drawn()[0] == round(1000 * thousands) and not torch.equal(drawn()[1], full)
+        # the slider's prefix is cut down, too
+        model.budget.value, model.lod.value = 1e6, 1.0
+        base = drawn()[0]
+        assert base < seen
+        model.budget.value = (base - 7) / 1000
+        assert drawn()[0] == base - 7
+        assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], full)
+
+
+@pytest.mark.slow
+def test_training_does_not_see_the_controls(trainer):
     model = trainer.pipeline.model
     camera, _ = trainer.pipeline.datamanager.next_train(0)
     trainer.pipeline.train()
     pictures = []
     for value in (3.0, 1.0):
-        model.lod.value = value
+        model.lod.value, model.budget.value = value, 0.01 if value == 1 else 0.0
         torch.manual_seed(0)
         pictures.append([p.detach() for p in model.get_outputs(camera)["prefixes"]])
     assert len(pictures[0]) == 3
@@ -100,7 +137,7 @@ def test_training_does_not_see_the_slider(trainer):
 def test_the_viewer_finds_the_controls_without_side_effects(trainer):
     """It reads every public attribute of the model; none may raise, even where the export is refused."""
     found = parse_object(trainer.pipeline, ViewerElement, "Custom Elements")
-    assert {element.name for _, element in found} == {"Level of detail", "Drawn"}
+    assert {element.name for _, element in found} == {"Level of detail", "Budget (thousands)", "Drawn"}
     assert all(path.count("/") == 2 for path, _ in found)
 
 
@@ -198,6 +235,26 @@ def test_slider_and_cut():
     assert level_cut(slider).level == 1.25
     single = lod_slider(1)
     assert single.disabled and single.min < single.max
+
+
+@pytest.mark.parametrize(
+    "value, count",
+    [
+        (0.0, None),
+        (0, None),
+        (-3.0, None),
+        (float("nan"), None),
+        (float("inf"), None),
+        (1e-9, 1),
+        (0.25, 250),
+        (3, 3000),
+    ],
+)
+def test_budget(value, count):
+    number = budget_number()
+    assert budget_of(number) is None
+    number.value = value
+    assert budget_of(number) == count
 
 
 def test_stopwatch():
