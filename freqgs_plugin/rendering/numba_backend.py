@@ -97,43 +97,38 @@ class _Composite(torch.autograd.Function):
         offsets, ids, boxes, slots, first, count = view.lists
         n, d = features.shape
         partial = torch.empty(len(ids), V_COLUMNS)
-        total = {
-            name: torch.zeros(n, width)
-            for name, width in (("means", 3), ("quats", 4), ("scales", 3), ("opacity", 1), ("xy", 2), ("abs", 2))
-        }
-        v_view = torch.zeros(n if ctx.needs_input_grad[6] else 0, 12)
-        v_feature_groups = []
+        moves, wants_pose = any(ctx.needs_input_grad[:4]) or ctx.needs_input_grad[6], ctx.needs_input_grad[6]
+        total, v_feature_groups = {}, []
         for number, group in enumerate(_feature_groups(features)):
             v_image = v_features[..., number * _CHANNELS : (number + 1) * _CHANNELS]
-            v_image = torch.nn.functional.pad(v_image, (0, _CHANNELS - v_image.shape[-1]))
+            if v_image.shape[-1] < _CHANNELS:
+                v_image = torch.nn.functional.pad(v_image, (0, _CHANNELS - v_image.shape[-1]))
             composite_backward(
                 offsets, ids, boxes, slots, view.splats, view.level, view.prefixes, view.own, group,
                 view.width, view.height, images[number].numpy(), light.numpy(), _array(v_image),
                 _array(v_light if number == 0 else torch.zeros_like(v_light)), partial.numpy(),
             )  # fmt: skip
-            out = {name: torch.zeros_like(tensor) for name, tensor in total.items()}
-            v_group = torch.zeros(n, _CHANNELS)
-            v_view_group = torch.zeros_like(v_view)
+            widths = {"means": 3, "quats": 4, "scales": 3, "opacity": 1, "features": 3, "xy": 2, "abs": 2}
+            out = {name: torch.zeros(n, width) for name, width in widths.items()}
+            out["view"] = torch.zeros(n if wants_pose else 0, 12)
             project_backward(
                 _array(means), _array(quats), _array(scales), _array(opacities), view.pose, view.intrinsics,
-                view.width, view.height, view.blur, view.antialiased, first, count, partial.numpy(),
+                view.width, view.height, view.blur, view.antialiased, moves, first, count, partial.numpy(),
                 out["means"].numpy(), out["quats"].numpy(), out["scales"].numpy(), out["opacity"].numpy()[:, 0],
-                v_group.numpy(), out["xy"].numpy(), out["abs"].numpy(), v_view_group.numpy(),
+                out["features"].numpy(), out["xy"].numpy(), out["abs"].numpy(), out["view"].numpy(),
             )  # fmt: skip
-            v_feature_groups.append(v_group)
-            for name in total:
-                total[name] += out[name]
-            v_view += v_view_group
+            v_feature_groups.append(out.pop("features"))
+            total = {name: total[name] + out[name] for name in out} if total else out
         if ctx.probe is not None and d <= _CHANNELS:
             ctx.probe.absgrad = total["abs"][None]
         v_pose = None
         if ctx.needs_input_grad[6]:
-            rows = v_view.double().sum(0).float()
+            rows = total["view"].double().sum(0).float()
             v_pose = torch.cat([torch.cat([rows[:9].view(3, 3), rows[9:, None]], 1), torch.zeros(1, 4)])
-        v_all = torch.cat(v_feature_groups, 1)[:, :d]
+        v_all = torch.cat(v_feature_groups, 1) if len(v_feature_groups) > 1 else v_feature_groups[0]
         return (
-            total["means"], total["quats"], total["scales"], total["opacity"][:, 0], v_all, total["xy"][None], v_pose,
-            None, None, None, None,
+            total["means"], total["quats"], total["scales"], total["opacity"][:, 0], v_all[:, :d], total["xy"][None],
+            v_pose, None, None, None, None,
         )  # fmt: skip
 
 
@@ -161,8 +156,7 @@ class NumbaRasterizer:
         depth: bool = True,
     ) -> Rendering:
         """See `Rasterizer.__call__`."""
-        level = torch.ones(len(splats), dtype=torch.int32)
-        return self._render(splats, level, 1, camera, background, blur, antialiased, False, depth)[0]
+        return self._render(splats, None, 1, camera, background, blur, antialiased, False, depth)[0]
 
     def prefixes(
         self,
@@ -186,7 +180,7 @@ class NumbaRasterizer:
         return self._render(splats, level.int(), num_levels, camera, background, blur, antialiased, own, False)
 
     def _render(
-        self, splats: Splats, level: Tensor, prefixes: int, camera: Camera, background: Tensor | None,
+        self, splats: Splats, level: Tensor | None, prefixes: int, camera: Camera, background: Tensor | None,
         blur: float, antialiased: bool, own: bool, depth: bool,
     ) -> list[Rendering]:  # fmt: skip
         _check(splats, camera)
@@ -205,7 +199,7 @@ class NumbaRasterizer:
         lists = tile_lists(order, projected.numpy(), camera.width, camera.height, n, get_num_threads())
         view = _View(
             pose, intrinsics, camera.width, camera.height, blur, antialiased, prefixes, own,
-            _array(level), projected.numpy(), lists,
+            None if level is None else _array(level), projected.numpy(), lists,
         )  # fmt: skip
         means2d = projected[None, :, :2].clone()
         wants_grad = torch.is_grad_enabled() and any(
@@ -233,7 +227,9 @@ class NumbaRasterizer:
             "n_cameras": 1,
             "tile_size": 16,
         }
-        return [Rendering(features[k], alpha[k], expected, info if k == prefixes - 1 else {}) for k in range(prefixes)]
+        # unbind: the gradient of indexing one by one would be an image of zeros per prefix
+        pictures = zip(features.unbind(0), alpha.unbind(0), strict=True)
+        return [Rendering(f, a, expected, info if k == prefixes - 1 else {}) for k, (f, a) in enumerate(pictures)]
 
 
 _warm = False
@@ -270,4 +266,5 @@ def _render_speck() -> None:
     camera = Camera(torch.eye(4), torch.eye(3), 1, 1)
     with torch.enable_grad():
         rasterizer(splats, camera).features.sum().backward()
-    rasterizer.prefixes(splats, torch.ones(1, dtype=torch.int32), 2, camera)
+        pictures = rasterizer.prefixes(splats, torch.ones(1, dtype=torch.int32), 2, camera)
+        torch.stack([p.features for p in pictures]).sum().backward()

@@ -10,7 +10,7 @@ import numpy as np
 
 from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.rendering.base import ALPHA_MIN
-from freqgs_plugin.rendering.numba_projection import HALF_A, HALF_C, OPACITY, REACH_X, REACH_Y, B, X, Y
+from freqgs_plugin.rendering.numba_projection import OPACITY, REACH_X, REACH_Y, S, U, V, X, Y
 
 TILE = 16
 STRIP = 8
@@ -47,18 +47,17 @@ def depth_order(depths, splats):
 
 
 @njit(error_model="numpy", inline="always")
-def _x_span(a, b, c, sheared, rx, ry, low, high):
+def _x_span(slope, extreme, sheared, rx, ry, low, high):
     """Least and greatest dx on the ellipse between rows dy = low and high (both within or nearest to it).
 
-    At offset dy the ellipse is `sheared` * sqrt(1 - (dy / ry)^2) px to either side of the line dx = -b / a dy.
+    At offset dy the ellipse is `sheared` * sqrt(1 - (dy / ry)^2) px to either side of the line dx = slope dy; dx is
+    greatest at dy = extreme.
     """
     low, high = min(max(low, -ry), ry), min(max(high, -ry), ry)
-    slope = b / a
     low_half = sheared * math.sqrt(max(0.0, 1.0 - (low / ry) * (low / ry)))
     high_half = sheared * math.sqrt(max(0.0, 1.0 - (high / ry) * (high / ry)))
-    greatest = max(-slope * low + low_half, -slope * high + high_half)
-    least = min(-slope * low - low_half, -slope * high - high_half)
-    extreme = -b / c * rx  # dy at which dx is greatest
+    greatest = max(slope * low + low_half, slope * high + high_half)
+    least = min(slope * low - low_half, slope * high - high_half)
     if low <= extreme <= high:
         greatest = rx
     if low <= -extreme <= high:
@@ -95,13 +94,14 @@ def tile_lists(order, splats, width, height, num_rows, bands):
     for k in prange(n):
         i = order[k]
         x, y = np.float64(splats[i, X]), np.float64(splats[i, Y])
-        a, b, c = 2.0 * splats[i, HALF_A], np.float64(splats[i, B]), 2.0 * splats[i, HALF_C]
+        u, s, v = np.float64(splats[i, U]), np.float64(splats[i, S]), np.float64(splats[i, V])
         rx, ry = np.float64(splats[i, REACH_X]) + 1e-30, np.float64(splats[i, REACH_Y]) + 1e-30
-        sheared = math.sqrt(2.0 * math.log(splats[i, OPACITY] / ALPHA_MIN) / a)
+        sheared = math.sqrt(math.log(splats[i, OPACITY] / ALPHA_MIN)) / u
+        slope, extreme = -s / u, -u * s / (v + s * s) * rx
         total = 0
         for r in range(row_start[k], row_start[k + 1]):
             top = (row_first[k] + r - row_start[k]) * TILE + 0.5 - y
-            least, greatest = _x_span(a, b, c, sheared, rx, ry, top, top + TILE - 1.0)
+            least, greatest = _x_span(slope, extreme, sheared, rx, ry, top, top + TILE - 1.0)
             low = max(math.ceil(x + least - 0.5 - _SLACK), 0.0)
             high = min(math.floor(x + greatest - 0.5 + _SLACK), width - 1.0)
             spans[r, 0], spans[r, 1] = 0, -1

@@ -1,12 +1,12 @@
 """Compiled front-to-back compositing of tile lists, and its gradient; all level prefixes in one pass.
 
-Every tile keeps one block of scratch per prefix. The first prefix that a Gaussian belongs to computes its alpha; each
-block hands alpha on to the next, so one exponential serves them all. Blocks have compile-time strides: that is what
-lets LLVM see that reads and writes do not overlap, and vectorise. A finished pixel has its transmittance stored
-negative.
+Every tile keeps one block of scratch per prefix, and walks its Gaussians from front to back, each over the rows and
+8-pixel strips that its ellipse meets, eight pixels at a time. Alpha is computed once and blended into the blocks of all
+prefixes that the Gaussian belongs to. A finished pixel has its transmittance stored negative.
 
-Pixels of a tile are ordered by strips of STRIP columns, then rows, so that a small Gaussian touches few of them and any
-box of rows in a strip is contiguous.
+Pixels of a tile are ordered by strips of STRIP columns, then rows. Within a strip dx is the same in every row, so a row
+costs one multiply-add for u in alpha = opacity exp(-(u^2 + v^2)), u = U dx + S dy, v^2 = V dy^2, and gradients are
+summed over rows as sums of v, v dy, v dy^2 per lane, which dx completes once per strip.
 """
 
 import numpy as np
@@ -14,11 +14,21 @@ import numpy as np
 from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from freqgs_plugin.rendering.numba_binning import STRIP, TILE
+from freqgs_plugin.rendering.numba_lanes import (
+    LANES,
+    any_set,
+    lanes,
+    load,
+    magnitude,
+    maximum,
+    minimum,
+    select,
+    store,
+    total,
+)
 from freqgs_plugin.rendering.numba_projection import (
     ABS_X,
     ABS_Y,
-    HALF_A,
-    HALF_C,
     OPACITY,
     STAT_X,
     STAT_Y,
@@ -29,135 +39,101 @@ from freqgs_plugin.rendering.numba_projection import (
     V_OPACITY,
     V_X,
     V_Y,
-    B,
+    S,
+    U,
+    V,
     X,
     Y,
 )
 
+ROWS = LANES // STRIP
+"""rows of a strip that are computed at once"""
 f4 = np.float32
 PIXELS = TILE * TILE
-STRIPS = TILE // STRIP
 STRIP_PIXELS = TILE * STRIP
 _ALPHA_MAX, _ALPHA_MIN, _STOP = f4(ALPHA_MAX), f4(ALPHA_MIN), f4(TRANSMITTANCE_MIN)
 _ZERO, _ONE, _HALF, _TWO = f4(0), f4(1), f4(0.5), f4(2)
 _CHECK_EVERY = 16
-"""Gaussians between two looks at whether a whole tile is finished"""
+"""Gaussians between two looks at which rows of a tile are unfinished"""
 
 # exp(-s) on [0, 6] as p(-s / 16)^16; beyond 6 every alpha is under ALPHA_MIN. p: degree-5 fit at Chebyshev points
-_REACH = f4(6)
-_SIXTEENTH = f4(-1 / 16)
+_LEAST = f4(-6 / 16)
+_QUARTER, _SIXTEENTH = f4(1 / 4), f4(1 / 16)
 _nodes = -0.1875 + 0.1875 * np.cos(np.pi * (np.arange(64) + 0.5) / 64)
 _E0, _E1, _E2, _E3, _E4, _E5 = (
     f4(c) for c in np.polynomial.polynomial.polyfit(_nodes, np.exp(_nodes), 5, w=np.exp(-_nodes))
 )
 
-# everything but signed zeros, NaN and infinities is exact enough in any order; the inputs are finite by construction
 _FAST = {"reassoc", "contract", "nsz", "arcp", "nnan", "ninf"}
 
-# fields of a forward block
-PX, PY, ALPHA, LIGHT, F0, F1, F2, DEPTH = range(8)
-FORWARD_FIELDS = 8
-FORWARD_BLOCK = FORWARD_FIELDS * PIXELS
+# fields of a forward block; each is one number per pixel
+LIGHT, F0, F1, F2, DEPTH = range(5)
+FORWARD_BLOCK = 5 * PIXELS
 # fields of a backward block; REST: what later Gaussians and the background still contribute, dotted with the gradient
-REST, G0, G1, G2, V_ALPHA, V_STAT = range(4, 10)
-BACKWARD_FIELDS = 10
-BACKWARD_BLOCK = BACKWARD_FIELDS * PIXELS
+REST, G0, G1, G2 = range(1, 5)
+BACKWARD_BLOCK = 5 * PIXELS
 
 
-@njit(fastmath=_FAST, error_model="numpy", inline="always")
-def _falloff(s):
-    x = min(s, _REACH) * _SIXTEENTH
+@njit(error_model="numpy", fastmath=_FAST, inline="always")
+def _alpha(u, v2, opacity):
+    """opacity exp(-(u^2 + v2)), capped, and 0 where it is under ALPHA_MIN; u and v2 are scaled by 1/4 and 1/16."""
+    x = maximum(lanes(_ZERO) - u * u - v2, lanes(_LEAST))
     p = _E0 + x * (_E1 + x * (_E2 + x * (_E3 + x * (_E4 + x * _E5))))
     p = p * p
     p = p * p
     p = p * p
-    return p * p
-
-
-@njit(fastmath=_FAST, error_model="numpy", inline="always")
-def _alpha(block, i, gx, gy, ha, b, hc, opacity):
-    dx, dy = block[i + PX * PIXELS] - gx, block[i + PY * PIXELS] - gy
-    alpha = min(opacity * _falloff(ha * dx * dx + hc * dy * dy + b * dx * dy), _ALPHA_MAX)
-    return alpha if alpha >= _ALPHA_MIN else _ZERO
-
-
-@njit(fastmath=_FAST, error_model="numpy", inline="always")
-def _blend(block, i, alpha, c0, c1, c2):
-    """Take one Gaussian's share of pixel i's light; returns the share."""
-    light = block[i + LIGHT * PIXELS]
-    weight = alpha * max(light, _ZERO)
-    left = light - weight
-    going = left > _STOP
-    weight = weight if going else _ZERO
-    block[i + LIGHT * PIXELS] = left if going else -abs(light)
-    block[i + F0 * PIXELS] += weight * c0
-    block[i + F1 * PIXELS] += weight * c1
-    block[i + F2 * PIXELS] += weight * c2
-    return weight
-
-
-@njit(fastmath=_FAST, error_model="numpy", cache=True)
-def _forward_only(block, n, gx, gy, ha, b, hc, opacity, c0, c1, c2):
-    for i in range(n):
-        _blend(block, i, _alpha(block, i, gx, gy, ha, b, hc, opacity), c0, c1, c2)
-
-
-@njit(fastmath=_FAST, error_model="numpy", cache=True)
-def _forward_only_with_depth(block, n, gx, gy, ha, b, hc, opacity, c0, c1, c2, z):
-    for i in range(n):
-        weight = _blend(block, i, _alpha(block, i, gx, gy, ha, b, hc, opacity), c0, c1, c2)
-        block[i + DEPTH * PIXELS] += weight * z
-
-
-@njit(fastmath=_FAST, error_model="numpy", cache=True)
-def _forward_first(block, n, gx, gy, ha, b, hc, opacity, c0, c1, c2):
-    for i in range(n):
-        alpha = _alpha(block, i, gx, gy, ha, b, hc, opacity)
-        block[i + FORWARD_BLOCK + ALPHA * PIXELS] = alpha
-        _blend(block, i, alpha, c0, c1, c2)
-
-
-@njit(fastmath=_FAST, error_model="numpy", cache=True)
-def _forward_next(block, n, c0, c1, c2):
-    for i in range(n):
-        alpha = block[i + ALPHA * PIXELS]
-        block[i + FORWARD_BLOCK + ALPHA * PIXELS] = alpha
-        _blend(block, i, alpha, c0, c1, c2)
-
-
-@njit(fastmath=_FAST, error_model="numpy", cache=True)
-def _brightest(light):
-    brightest = _ZERO
-    for i in range(PIXELS):
-        brightest = max(brightest, light[i])
-    return brightest
+    alpha = minimum(p * p * opacity, lanes(_ALPHA_MAX))
+    return select(alpha >= _ALPHA_MIN, alpha, lanes(_ZERO))
 
 
 @njit(error_model="numpy", inline="always")
-def _pixel(strip, row, column):
-    return strip * STRIP_PIXELS + row * STRIP + column
+def _first_prefix(level, i):
+    """Where Gaussian i joins; without levels a constant, which removes the loop over prefixes."""
+    if level is None:
+        return 0
+    return level[i] - 1
 
 
 @njit(error_model="numpy", inline="always")
-def _start_block(block, tx, ty, width, height):
-    """Pixel centres relative to the tile; light 1 inside the image and 'finished' outside of it."""
-    for strip in range(STRIPS):
-        for row in range(TILE):
-            for column in range(STRIP):
-                p = _pixel(strip, row, column)
-                x, y = strip * STRIP + column, row
-                block[p + PX * PIXELS] = f4(x) + _HALF
-                block[p + PY * PIXELS] = f4(y) + _HALF
-                inside = tx * TILE + x < width and ty * TILE + y < height
-                block[p + LIGHT * PIXELS] = _ONE if inside else -_ONE
+def _last_prefix(level, prefixes):
+    if level is None:
+        return 0
+    return prefixes - 1
+
+
+@njit(error_model="numpy", cache=True)
+def _lane_centres():
+    """Pixel centres of each lane: column in the strip, and row."""
+    lane = np.arange(LANES)
+    return (lane % STRIP).astype(np.float32) + _HALF, (lane // STRIP).astype(np.float32) + _HALF
 
 
 @njit(error_model="numpy", inline="always")
-def _all_finished(scratch, prefixes, stride):
-    for k in range(prefixes):
-        if _brightest(scratch[k * stride + LIGHT * PIXELS :]) > _ZERO:
-            return False
-    return True
+def _start_light(scratch, at, tx, ty, width, height):
+    """Light 1 inside the image, 'finished' outside of it."""
+    for row in range(TILE):
+        for x in range(TILE):
+            inside = tx * TILE + x < width and ty * TILE + row < height
+            scratch[at + _pixel(x, row)] = _ONE if inside else -_ONE
+
+
+@njit(error_model="numpy", inline="always")
+def _pixel(x, row):
+    return x // STRIP * STRIP_PIXELS + row * STRIP + x % STRIP
+
+
+@njit(error_model="numpy", fastmath=_FAST, cache=True)
+def _unfinished_rows(scratch, prefixes, block):
+    """First and last row with an unfinished pixel in any prefix; TILE and -1 if there is none."""
+    first, last = TILE, -1
+    for row in range(0, TILE, ROWS):
+        brightest = lanes(-_ONE)
+        for k in range(prefixes):
+            for x in range(0, TILE, STRIP):
+                brightest = maximum(brightest, load(scratch, k * block + LIGHT * PIXELS + _pixel(x, row)))
+        if any_set(brightest > _ZERO):
+            first, last = min(first, row), row + ROWS - 1
+    return first, last
 
 
 @njit(parallel=True, fastmath=_FAST, error_model="numpy", cache=True)
@@ -166,44 +142,55 @@ def composite(
 ):
     """Fill `image` [prefixes, h, w, 3], `light` (final transmittance) [prefixes, h, w] and, if asked, `depth` [h, w].
 
-    `level` [n] in 1..prefixes; with one prefix and all levels 1 this is plain compositing. Depth needs one prefix.
+    `level` [n] in 1..prefixes, or None: all belong to a single prefix. Depth needs one prefix.
     """
     tiles_x = (width + TILE - 1) // TILE
+    columns, rows = _lane_centres()
     for t in prange(offsets.shape[0] - 1):
         ty = t // tiles_x
         tx = t - ty * tiles_x
-        scratch = np.zeros((prefixes + 1) * FORWARD_BLOCK, np.float32)
+        scratch = np.zeros(prefixes * FORWARD_BLOCK, np.float32)
         for k in range(prefixes):
-            _start_block(scratch[k * FORWARD_BLOCK :], tx, ty, width, height)
-        since_check = 0
+            _start_light(scratch, k * FORWARD_BLOCK + LIGHT * PIXELS, tx, ty, width, height)
+        last_prefix = _last_prefix(level, prefixes)
+        since_check, first_row, last_row = 0, 0, TILE - 1
         for entry in range(offsets[t], offsets[t + 1]):
             i, box = ids[entry], np.int64(boxes[entry])
             gx, gy = splats[i, X] - f4(tx * TILE), splats[i, Y] - f4(ty * TILE)
-            ha, b, hc, opacity = splats[i, HALF_A], splats[i, B], splats[i, HALF_C], splats[i, OPACITY]
+            su, ss, sv, opacity = splats[i, U], splats[i, S], splats[i, V], splats[i, OPACITY]
+            qu, qs, qv = su * _QUARTER, ss * _QUARTER, sv * _SIXTEENTH
             c0, c1, c2 = features[i, 0], features[i, 1], features[i, 2]
-            row, n = box & 15, ((box >> 4 & 15) - (box & 15) + 1) * STRIP
+            z = depths[i]
+            first_prefix = _first_prefix(level, i)
             for strip in range(box >> 8 & 15, (box >> 12) + 1):
-                at = _pixel(strip, row, 0)
-                if prefixes == 1:
-                    if with_depth:
-                        _forward_only_with_depth(scratch[at:], n, gx, gy, ha, b, hc, opacity, c0, c1, c2, depths[i])
-                    else:
-                        _forward_only(scratch[at:], n, gx, gy, ha, b, hc, opacity, c0, c1, c2)
-                else:
-                    k = level[i] - 1
-                    _forward_first(scratch[k * FORWARD_BLOCK + at :], n, gx, gy, ha, b, hc, opacity, c0, c1, c2)
-                    for later in range(k + 1, prefixes):
-                        _forward_next(scratch[later * FORWARD_BLOCK + at :], n, c0, c1, c2)
+                u0 = (load(columns, 0) + (f4(strip * STRIP) - gx)) * qu
+                for row in range(max(box & 15, first_row) // ROWS * ROWS, min(box >> 4 & 15, last_row) + 1, ROWS):
+                    dy = load(rows, 0) + (f4(row) - gy)
+                    alpha = _alpha(u0 + dy * qs, dy * dy * qv, opacity)
+                    for k in range(first_prefix, last_prefix + 1):
+                        at = k * FORWARD_BLOCK + strip * STRIP_PIXELS + row * STRIP
+                        before = load(scratch, at + LIGHT * PIXELS)
+                        weight = alpha * maximum(before, lanes(_ZERO))
+                        left = before - weight
+                        going = left > _STOP
+                        weight = select(going, weight, lanes(_ZERO))
+                        store(scratch, at + LIGHT * PIXELS, select(going, left, lanes(_ZERO) - magnitude(before)))
+                        store(scratch, at + F0 * PIXELS, load(scratch, at + F0 * PIXELS) + weight * c0)
+                        store(scratch, at + F1 * PIXELS, load(scratch, at + F1 * PIXELS) + weight * c1)
+                        store(scratch, at + F2 * PIXELS, load(scratch, at + F2 * PIXELS) + weight * c2)
+                        if with_depth:
+                            store(scratch, at + DEPTH * PIXELS, load(scratch, at + DEPTH * PIXELS) + weight * z)
             since_check += 1
             if since_check == _CHECK_EVERY:
                 since_check = 0
-                if _all_finished(scratch, prefixes, FORWARD_BLOCK):
+                first_row, last_row = _unfinished_rows(scratch, prefixes, FORWARD_BLOCK)
+                if first_row > last_row:
                     break
         for k in range(prefixes):
             block = scratch[k * FORWARD_BLOCK :]
             for row in range(min(TILE, height - ty * TILE)):
                 for x in range(min(TILE, width - tx * TILE)):
-                    p = _pixel(x // STRIP, row, x % STRIP)
+                    p = _pixel(x, row)
                     y, c = ty * TILE + row, tx * TILE + x
                     image[k, y, c, 0] = block[p + F0 * PIXELS]
                     image[k, y, c, 1] = block[p + F1 * PIXELS]
@@ -213,127 +200,17 @@ def composite(
                         depth[y, c] = block[p + DEPTH * PIXELS]
 
 
-@njit(fastmath=_FAST, error_model="numpy", inline="always")
-def _unblend(block, i, alpha, c0, c1, c2):
-    """Repeat `_blend` at pixel i; returns weight, the gradient's feature components, and dL/dalpha."""
-    light = block[i + LIGHT * PIXELS]
-    weight = alpha * max(light, _ZERO)
-    left = light - weight
-    going = left > _STOP
-    weight = weight if going else _ZERO
-    block[i + LIGHT * PIXELS] = left if going else -abs(light)
-    g0, g1, g2 = block[i + G0 * PIXELS], block[i + G1 * PIXELS], block[i + G2 * PIXELS]
-    q = c0 * g0 + c1 * g1 + c2 * g2
-    rest = block[i + REST * PIXELS] - weight * q
-    block[i + REST * PIXELS] = rest
-    v_alpha = light * q - rest / (_ONE - alpha)
-    return weight, g0, g1, g2, v_alpha if going else _ZERO
-
-
-@njit(fastmath=_FAST, error_model="numpy", cache=True)
-def _backward_only(block, n, gx, gy, ha, b, hc, opacity, c0, c1, c2):
-    s0 = s1 = s2 = s = sx = sy = sxx = sxy = syy = ax = ay = _ZERO
-    a2, c2c = _TWO * ha, _TWO * hc
-    for i in range(n):
-        alpha = _alpha(block, i, gx, gy, ha, b, hc, opacity)
-        weight, g0, g1, g2, v = _unblend(block, i, alpha, c0, c1, c2)
-        s0 += weight * g0
-        s1 += weight * g1
-        s2 += weight * g2
-        dx, dy = block[i + PX * PIXELS] - gx, block[i + PY * PIXELS] - gy
-        v = alpha * v if alpha < _ALPHA_MAX else _ZERO
-        s += v
-        vx, vy = v * dx, v * dy
-        sx += vx
-        sy += vy
-        sxx += vx * dx
-        sxy += vx * dy
-        syy += vy * dy
-        ax += abs(a2 * vx + b * vy)
-        ay += abs(b * vx + c2c * vy)
-    return s0, s1, s2, s, sx, sy, sxx, sxy, syy, ax, ay
-
-
-@njit(fastmath=_FAST, error_model="numpy", cache=True)
-def _backward_first(block, n, gx, gy, ha, b, hc, opacity, c0, c1, c2, stat):
-    s0 = s1 = s2 = _ZERO
-    for i in range(n):
-        alpha = _alpha(block, i, gx, gy, ha, b, hc, opacity)
-        block[i + BACKWARD_BLOCK + ALPHA * PIXELS] = alpha
-        weight, g0, g1, g2, v = _unblend(block, i, alpha, c0, c1, c2)
-        block[i + BACKWARD_BLOCK + V_ALPHA * PIXELS] = v
-        block[i + BACKWARD_BLOCK + V_STAT * PIXELS] = stat * v
-        s0 += weight * g0
-        s1 += weight * g1
-        s2 += weight * g2
-    return s0, s1, s2
-
-
-@njit(fastmath=_FAST, error_model="numpy", cache=True)
-def _backward_next(block, n, c0, c1, c2, stat):
-    s0 = s1 = s2 = _ZERO
-    for i in range(n):
-        alpha = block[i + ALPHA * PIXELS]
-        block[i + BACKWARD_BLOCK + ALPHA * PIXELS] = alpha
-        weight, g0, g1, g2, v = _unblend(block, i, alpha, c0, c1, c2)
-        block[i + BACKWARD_BLOCK + V_ALPHA * PIXELS] = block[i + V_ALPHA * PIXELS] + v
-        block[i + BACKWARD_BLOCK + V_STAT * PIXELS] = block[i + V_STAT * PIXELS] + stat * v
-        s0 += weight * g0
-        s1 += weight * g1
-        s2 += weight * g2
-    return s0, s1, s2
-
-
-@njit(fastmath=_FAST, error_model="numpy", cache=True)
-def _moments(block, n, gx, gy, ha, b, hc):
-    """Sums over pixels of alpha dL/dalpha times 1, d, d d^T; times d also for the statistic's part, and absolutes."""
-    s = sx = sy = sxx = sxy = syy = tx = ty = ax = ay = _ZERO
-    a2, c2 = _TWO * ha, _TWO * hc
-    for i in range(n):
-        dx, dy = block[i + PX * PIXELS] - gx, block[i + PY * PIXELS] - gy
-        alpha = block[i + ALPHA * PIXELS]
-        alpha = alpha if alpha < _ALPHA_MAX else _ZERO
-        v, u = alpha * block[i + V_ALPHA * PIXELS], alpha * block[i + V_STAT * PIXELS]
-        s += v
-        vx, vy = v * dx, v * dy
-        sx += vx
-        sy += vy
-        sxx += vx * dx
-        sxy += vx * dy
-        syy += vy * dy
-        ux, uy = u * dx, u * dy
-        tx += ux
-        ty += uy
-        ax += abs(a2 * ux + b * uy)
-        ay += abs(b * ux + c2 * uy)
-    return s, sx, sy, sxx, sxy, syy, tx, ty, ax, ay
-
-
-@njit(fastmath=_FAST, error_model="numpy", inline="always")
-def _add_moments(out, opacity, a, b, c, s, sx, sy, sxx, sxy, syy, tx, ty, ax, ay):
-    out[V_OPACITY] += s / opacity
-    out[V_X] += a * sx + b * sy
-    out[V_Y] += b * sx + c * sy
-    out[V_A] -= _HALF * sxx
-    out[V_B] -= sxy
-    out[V_C] -= _HALF * syy
-    out[STAT_X] += a * tx + b * ty
-    out[STAT_Y] += b * tx + c * ty
-    out[ABS_X] += ax
-    out[ABS_Y] += ay
-
-
-@njit(fastmath=_FAST, error_model="numpy", inline="always")
-def _start_gradient(block, tx, ty, width, height, image, light, v_image, v_light):
-    _start_block(block, tx, ty, width, height)
+@njit(error_model="numpy", inline="always")
+def _start_gradient(scratch, at, tx, ty, width, height, image, light, v_image, v_light):
+    _start_light(scratch, at + LIGHT * PIXELS, tx, ty, width, height)
     for row in range(min(TILE, height - ty * TILE)):
         for x in range(min(TILE, width - tx * TILE)):
-            p = _pixel(x // STRIP, row, x % STRIP)
+            p = at + _pixel(x, row)
             y, c = ty * TILE + row, tx * TILE + x
             g0, g1, g2 = v_image[y, c, 0], v_image[y, c, 1], v_image[y, c, 2]
-            block[p + G0 * PIXELS], block[p + G1 * PIXELS], block[p + G2 * PIXELS] = g0, g1, g2
+            scratch[p + G0 * PIXELS], scratch[p + G1 * PIXELS], scratch[p + G2 * PIXELS] = g0, g1, g2
             done = g0 * image[y, c, 0] + g1 * image[y, c, 1] + g2 * image[y, c, 2]
-            block[p + REST * PIXELS] = done + light[y, c] * v_light[y, c]
+            scratch[p + REST * PIXELS] = done + light[y, c] * v_light[y, c]
 
 
 @njit(parallel=True, fastmath=_FAST, error_model="numpy", cache=True)
@@ -346,54 +223,100 @@ def composite_backward(
     `own`: the statistic columns hold the gradient of the prefix that equals the Gaussian's level, else of the last one.
     """
     tiles_x = (width + TILE - 1) // TILE
+    columns, rows = _lane_centres()
     for t in prange(offsets.shape[0] - 1):
         ty = t // tiles_x
         tx = t - ty * tiles_x
-        scratch = np.zeros((prefixes + 1) * BACKWARD_BLOCK, np.float32)
+        scratch = np.zeros(prefixes * BACKWARD_BLOCK, np.float32)
         for k in range(prefixes):
-            block = scratch[k * BACKWARD_BLOCK :]
-            _start_gradient(block, tx, ty, width, height, image[k], light[k], v_image[k], v_light[k])
-        _start_block(scratch[prefixes * BACKWARD_BLOCK :], tx, ty, width, height)
-        since_check = 0
-        finished = False
+            _start_gradient(
+                scratch, k * BACKWARD_BLOCK, tx, ty, width, height, image[k], light[k], v_image[k], v_light[k]
+            )
+        last_prefix = _last_prefix(level, prefixes)
+        since_check, first_row, last_row = 0, 0, TILE - 1
         for entry in range(offsets[t], offsets[t + 1]):
             out = partial[slots[entry]]
-            for column in range(V_COLUMNS):
-                out[column] = _ZERO
-            if finished:
+            if first_row > last_row:
+                for column in range(V_COLUMNS):
+                    out[column] = _ZERO
                 continue
             i, box = ids[entry], np.int64(boxes[entry])
             gx, gy = splats[i, X] - f4(tx * TILE), splats[i, Y] - f4(ty * TILE)
-            ha, b, hc, opacity = splats[i, HALF_A], splats[i, B], splats[i, HALF_C], splats[i, OPACITY]
+            su, ss, sv, opacity = splats[i, U], splats[i, S], splats[i, V], splats[i, OPACITY]
+            qu, qs, qv = su * _QUARTER, ss * _QUARTER, sv * _SIXTEENTH
             c0, c1, c2 = features[i, 0], features[i, 1], features[i, 2]
-            row, n = box & 15, ((box >> 4 & 15) - (box & 15) + 1) * STRIP
+            judged = _first_prefix(level, i) if own else last_prefix
+            zero = lanes(_ZERO)
+            # per lane: gradients of the features; moments of alpha dL/dalpha, of its judged part, and of absolutes
+            v0 = v1 = v2 = m = mx = my = mxx = mxy = myy = jx = jy = ax = ay = zero
+            first_prefix = _first_prefix(level, i)
             for strip in range(box >> 8 & 15, (box >> 12) + 1):
-                at = _pixel(strip, row, 0)
-                if prefixes == 1:
-                    s0, s1, s2, s, sx, sy, sxx, sxy, syy, ax, ay = _backward_only(
-                        scratch[at:], n, gx, gy, ha, b, hc, opacity, c0, c1, c2
-                    )
-                    ux, uy = sx, sy
-                else:
-                    k = level[i] - 1
-                    stat = _ONE if own or k == prefixes - 1 else _ZERO
-                    s0, s1, s2 = _backward_first(
-                        scratch[k * BACKWARD_BLOCK + at :], n, gx, gy, ha, b, hc, opacity, c0, c1, c2, stat
-                    )
-                    for later in range(k + 1, prefixes):
-                        stat = _ONE if not own and later == prefixes - 1 else _ZERO
-                        r0, r1, r2 = _backward_next(scratch[later * BACKWARD_BLOCK + at :], n, c0, c1, c2, stat)
-                        s0 += r0
-                        s1 += r1
-                        s2 += r2
-                    s, sx, sy, sxx, sxy, syy, ux, uy, ax, ay = _moments(
-                        scratch[prefixes * BACKWARD_BLOCK + at :], n, gx, gy, ha, b, hc
-                    )
-                out[0] += s0
-                out[1] += s1
-                out[2] += s2
-                _add_moments(out, opacity, _TWO * ha, b, _TWO * hc, s, sx, sy, sxx, sxy, syy, ux, uy, ax, ay)
+                dx = load(columns, 0) + (f4(strip * STRIP) - gx)
+                u0 = dx * qu
+                # sums over this strip's rows of alpha dL/dalpha times 1, dy, dy^2; and of the judged prefix's part
+                s = sy = syy = r = ry = zero
+                for row in range(max(box & 15, first_row) // ROWS * ROWS, min(box >> 4 & 15, last_row) + 1, ROWS):
+                    dy = load(rows, 0) + (f4(row) - gy)
+                    u = u0 + dy * qs
+                    alpha = _alpha(u, dy * dy * qv, opacity)
+                    beyond = _ONE / (_ONE - alpha)
+                    v_alpha = v_judged = zero
+                    for k in range(first_prefix, last_prefix + 1):
+                        at = k * BACKWARD_BLOCK + strip * STRIP_PIXELS + row * STRIP
+                        before = load(scratch, at + LIGHT * PIXELS)
+                        weight = alpha * maximum(before, zero)
+                        left = before - weight
+                        going = left > _STOP
+                        weight = select(going, weight, zero)
+                        store(scratch, at + LIGHT * PIXELS, select(going, left, zero - magnitude(before)))
+                        g0 = load(scratch, at + G0 * PIXELS)
+                        g1 = load(scratch, at + G1 * PIXELS)
+                        g2 = load(scratch, at + G2 * PIXELS)
+                        q = g0 * c0 + g1 * c1 + g2 * c2
+                        rest = load(scratch, at + REST * PIXELS) - weight * q
+                        store(scratch, at + REST * PIXELS, rest)
+                        v0 = v0 + weight * g0
+                        v1 = v1 + weight * g1
+                        v2 = v2 + weight * g2
+                        part = select(going, before * q - rest * beyond, zero)
+                        v_alpha = v_alpha + part
+                        if k == judged:
+                            v_judged = part
+                    held = select(alpha < _ALPHA_MAX, alpha, zero)
+                    v_alpha, v_judged = v_alpha * held, v_judged * held
+                    s = s + v_alpha
+                    sy = sy + v_alpha * dy
+                    syy = syy + v_alpha * dy * dy
+                    r = r + v_judged
+                    ry = ry + v_judged * dy
+                    size = magnitude(v_judged)
+                    ax = ax + size * magnitude(u)
+                    ay = ay + size * magnitude(u * ss + dy * (_QUARTER * sv))
+                m = m + s
+                mx = mx + s * dx
+                my = my + sy
+                mxx = mxx + s * dx * dx
+                mxy = mxy + sy * dx
+                myy = myy + syy
+                jx = jx + r * dx
+                jy = jy + ry
+            a, b, c = _TWO * su * su, _TWO * su * ss, _TWO * (sv + ss * ss)
+            x_sum, y_sum, x_judged, y_judged = total(mx), total(my), total(jx), total(jy)
+            out[0] = total(v0)
+            out[1] = total(v1)
+            out[2] = total(v2)
+            out[V_OPACITY] = total(m) / opacity
+            out[V_X] = a * x_sum + b * y_sum
+            out[V_Y] = b * x_sum + c * y_sum
+            out[V_A] = -_HALF * total(mxx)
+            out[V_B] = -total(mxy)
+            out[V_C] = -_HALF * total(myy)
+            out[STAT_X] = a * x_judged + b * y_judged
+            out[STAT_Y] = b * x_judged + c * y_judged
+            # u is U dx + S dy, quartered: (d/dx, d/dy)(u^2 + v^2) = 8 (U u, S u + V dy / 4)
+            out[ABS_X] = f4(8) * su * total(ax)
+            out[ABS_Y] = f4(8) * total(ay)
             since_check += 1
             if since_check == _CHECK_EVERY:
                 since_check = 0
-                finished = _all_finished(scratch, prefixes, BACKWARD_BLOCK)
+                first_row, last_row = _unfinished_rows(scratch, prefixes, BACKWARD_BLOCK)

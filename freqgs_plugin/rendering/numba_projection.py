@@ -13,9 +13,9 @@ from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.functional.projection import QUATERNION_MIN, STD_MAX
 from freqgs_plugin.rendering.base import ALPHA_MIN, FOV_MARGIN, NEAR_PLANE, RADIUS_SIGMAS
 
-# columns of a projected Gaussian: centre (px), conic / 2 on the diagonal, opacity after compensation, and the
-# half-width and half-height (px) of the ellipse on which alpha >= ALPHA_MIN
-X, Y, HALF_A, B, HALF_C, OPACITY, REACH_X, REACH_Y = range(8)
+# columns of a projected Gaussian: centre (px), its falloff exp(-(U dx + S dy)^2 - V dy^2), opacity after compensation,
+# and the half-width and half-height (px) of the ellipse on which alpha >= ALPHA_MIN
+X, Y, U, S, V, OPACITY, REACH_X, REACH_Y = range(8)
 COLUMNS = 8
 
 # columns of the gradient of one Gaussian (or of one Gaussian in one tile)
@@ -107,7 +107,8 @@ def _project_one(
     x, y = u * fx + cx, v * fy + cy
     out[i, X], out[i, Y] = x, y
     conics[i, 0], conics[i, 1], conics[i, 2] = c / det, -b / det, a / det
-    out[i, HALF_A], out[i, B], out[i, HALF_C] = 0.5 * c / det, -b / det, 0.5 * a / det
+    slope = math.sqrt(0.5 * c / det)
+    out[i, U], out[i, S], out[i, V] = slope, -slope * b / c, 0.5 / c
     middle = 0.5 * (a + c)
     radius = math.ceil(RADIUS_SIGMAS * math.sqrt(middle + math.sqrt(max(0.01, middle * middle - det))))
     if not (x + radius > 0 and x - radius < width and y + radius > 0 and y - radius < height):
@@ -137,7 +138,7 @@ def project(
 
 @njit(error_model="numpy", fastmath={"contract"}, cache=True)
 def _carry_back_one(
-    i, means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased,
+    i, means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, moves,
     first, count, partial, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_abs, v_view,
 ):  # fmt: skip
     fx, fy, cx, cy = intrinsics
@@ -162,6 +163,8 @@ def _carry_back_one(
     v_features[i, 0], v_features[i, 1], v_features[i, 2] = g0, g1, g2
     v_means2d[i, 0], v_means2d[i, 1] = stat_x, stat_y
     v_abs[i, 0], v_abs[i, 1] = abs_x, abs_y
+    if not moves:
+        return
 
     m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     z = R[2, 0] * m0 + R[2, 1] * m1 + R[2, 2] * m2 + view[2, 3]
@@ -266,17 +269,18 @@ def _carry_back_one(
 
 @njit(parallel=True, error_model="numpy", fastmath={"contract"}, cache=True)
 def project_backward(
-    means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased,
+    means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, moves,
     first, count, partial, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_abs, v_view,
 ):  # fmt: skip
     """Sum each Gaussian's rows of `partial` [slots, V_COLUMNS] and carry them back to its parameters.
 
     `first` and `count` [n] name a Gaussian's rows. `v_view` [n, 12] receives each Gaussian's share of the gradient of
-    the world-to-camera matrix (rows of R, then t) unless it has no rows.
+    the world-to-camera matrix (rows of R, then t) unless it has no rows. Unless `moves`, only features and statistics
+    are wanted.
     """
     for i in prange(means.shape[0]):
         if count[i] > 0:
             _carry_back_one(
-                i, means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased,
+                i, means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, moves,
                 first, count, partial, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_abs, v_view,
             )  # fmt: skip

@@ -1,0 +1,185 @@
+"""Several float32 numbers as one value in compiled kernels: LLVM's own vectors, so that speed does not hang on what its
+loop vectoriser makes of a loop.
+
+`Lanes` are added, subtracted, multiplied, divided and compared with Lanes or float32, elementwise; a comparison gives a
+mask. Arithmetic assumes finite numbers and may be reordered, as numba's `fastmath` does. On a CPU whose
+registers are narrower LLVM splits the vectors.
+"""
+
+import operator
+from typing import Any
+
+from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
+from numba import types
+from numba.core import cgutils
+from numba.core.typing import signature
+from numba.core.typing.templates import AbstractTemplate, infer_global
+from numba.extending import intrinsic as _intrinsic
+from numba.extending import lower_builtin, lower_cast, models, register_model
+
+LANES = 16 if get_host_cpu_features().get("avx512f") else 8
+"""numbers in one value: what one register holds"""
+
+_FLAGS = ("reassoc", "contract", "nsz", "arcp", "nnan", "ninf")
+_FLOATS, _BITS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(1), LANES)
+
+
+def intrinsic(function: Any) -> Any:
+    """numba's `intrinsic`; callers do not pass its first argument, which type checkers cannot know."""
+    return _intrinsic(function)  # pyright: ignore[reportOptionalCall]
+
+
+class _Vector(types.Type):
+    """Type of Lanes (`float32 lanes`) or of a mask (`bool lanes`)."""
+
+    def can_convert_from(self, typingctx: Any, other: Any) -> Any:
+        from numba.core.typeconv import Conversion
+
+        return Conversion.promote if self is lanes_type and other == types.float32 else None
+
+
+lanes_type, mask_type = _Vector(f"float32x{LANES}"), _Vector(f"boolx{LANES}")
+
+
+@register_model(_Vector)
+class _Model(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: _Vector):
+        super().__init__(manager, kind, _FLOATS if kind.name == lanes_type.name else _BITS)
+
+
+def _broadcast(builder: Any, number: Any) -> Any:
+    vector = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
+    first = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    return builder.shuffle_vector(vector, ir.Constant(_FLOATS, ir.Undefined), first)
+
+
+@lower_cast(types.float32, lanes_type)  # pyright: ignore[reportOptionalCall]
+def _(context, builder, source, target, value):  # pyright: ignore[reportUnusedParameter]
+    return _broadcast(builder, value)
+
+
+def _elementwise(operation: Any, result: _Vector, build: Any) -> None:
+    """Teach numba `operation` on two Lanes, or Lanes and a float32."""
+
+    @infer_global(operation)
+    class _Typing(AbstractTemplate):
+        def generic(self, args: Any, kws: Any) -> Any:
+            if lanes_type in args and all(a in (lanes_type, types.float32) for a in args):
+                return signature(result, *[lanes_type] * len(args))
+            return None
+
+    @lower_builtin(operation, lanes_type, lanes_type)
+    def _(context, builder, sig, args):  # pyright: ignore[reportUnusedParameter]
+        return build(builder, *args)
+
+
+_elementwise(operator.add, lanes_type, lambda builder, a, b: builder.fadd(a, b, flags=_FLAGS))
+_elementwise(operator.sub, lanes_type, lambda builder, a, b: builder.fsub(a, b, flags=_FLAGS))
+_elementwise(operator.mul, lanes_type, lambda builder, a, b: builder.fmul(a, b, flags=_FLAGS))
+_elementwise(operator.truediv, lanes_type, lambda builder, a, b: builder.fdiv(a, b, flags=_FLAGS))
+_elementwise(operator.gt, mask_type, lambda builder, a, b: builder.fcmp_ordered(">", a, b, flags=_FLAGS))
+_elementwise(operator.ge, mask_type, lambda builder, a, b: builder.fcmp_ordered(">=", a, b, flags=_FLAGS))
+_elementwise(operator.lt, mask_type, lambda builder, a, b: builder.fcmp_ordered("<", a, b, flags=_FLAGS))
+
+
+def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
+
+
+@intrinsic
+def load(typingctx, array, index):
+    """The Lanes at array[index : index + LANES] of a contiguous float32 array [n]; bounds are not checked."""
+
+    def build(context, builder, sig, args):
+        return builder.load(_address(context, builder, sig.args[0], *args), align=4)
+
+    return lanes_type(array, types.intp), build
+
+
+@intrinsic
+def store(typingctx, array, index, value):
+    """array[index : index + LANES] = value, as `load` reads."""
+
+    def build(context, builder, sig, args):
+        builder.store(args[2], _address(context, builder, sig.args[0], *args[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, lanes_type), build
+
+
+@intrinsic
+def lanes(typingctx, number):
+    """All lanes equal to a float32."""
+    return lanes_type(types.float32), lambda context, builder, sig, args: _broadcast(builder, args[0])
+
+
+@intrinsic
+def select(typingctx, mask, a, b):
+    """a where the mask is set, else b."""
+
+    def build(context, builder, sig, args):
+        return builder.select(*args)
+
+    return lanes_type(mask_type, lanes_type, lanes_type), build
+
+
+@intrinsic
+def minimum(typingctx, a, b):
+    """The lesser, lane by lane."""
+
+    def build(context, builder, sig, args):
+        return builder.select(builder.fcmp_ordered("<", *args, flags=_FLAGS), *args)
+
+    return lanes_type(lanes_type, lanes_type), build
+
+
+@intrinsic
+def maximum(typingctx, a, b):
+    """The greater, lane by lane."""
+
+    def build(context, builder, sig, args):
+        return builder.select(builder.fcmp_ordered(">", *args, flags=_FLAGS), *args)
+
+    return lanes_type(lanes_type, lanes_type), build
+
+
+@intrinsic
+def magnitude(typingctx, a):
+    """Absolute value, lane by lane."""
+
+    def build(context, builder, sig, args):
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(_FLOATS, [_FLOATS]), f"llvm.fabs.v{LANES}f32"
+        )
+        return builder.call(function, args)
+
+    return lanes_type(lanes_type), build
+
+
+@intrinsic
+def any_set(typingctx, mask):
+    """Whether any lane of a mask is set."""
+
+    def build(context, builder, sig, args):
+        bits = builder.bitcast(args[0], ir.IntType(LANES))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
+    return types.boolean(mask_type), build
+
+
+@intrinsic
+def total(typingctx, a):
+    """Sum of all lanes, float32."""
+
+    def build(context, builder, sig, args):
+        value, width = args[0], LANES
+        while width > 1:
+            width //= 2
+            order = ir.VectorType(ir.IntType(32), LANES)
+            upper = ir.Constant(order, [(i + width) % LANES for i in range(LANES)])
+            value = builder.fadd(value, builder.shuffle_vector(value, value, upper), flags=_FLAGS)
+        return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
+
+    return types.float32(lanes_type), build
