@@ -45,7 +45,7 @@ def demo(
 
 def stability(
     output_dir: Path = Path("stability-out"),
-    only: Literal["geometry", "compositing"] | None = None,
+    only: Literal["geometry", "compositing", "losses"] | None = None,
     quick: bool = False,
 ) -> None:
     """Run a grid of extremes through every backend and dtype: value and gradient errors, finite or not, time.

@@ -64,6 +64,17 @@ def _unpair(here, mirrored):
     return a, b
 
 
+@njit(error_model="numpy", cache=True, nogil=True)
+def _polar(value):
+    """|z| and z / |z| (0 at 0); divided by the larger part before squaring, so that nothing over- or underflows."""
+    largest = max(abs(value[0]), abs(value[1]))
+    if not largest > 0:
+        return largest, largest, largest
+    real, imaginary = value[0] / largest, value[1] / largest
+    length = np.sqrt(real * real + imaginary * imaginary)
+    return largest * length, real / length, imaginary / length
+
+
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)
 def _magnitudes(spectrum, out):
     pairs, height, width = spectrum.shape[:3]
@@ -72,17 +83,17 @@ def _magnitudes(spectrum, out):
         here, mirrored = spectrum[p, u], spectrum[p, (height - u) % height]
         for v in range(width // 2 + 1):
             a, b = _unpair(here[v], mirrored[(width - v) % width])
-            out[2 * p, u, v] = np.sqrt(a[0] * a[0] + a[1] * a[1])
+            out[2 * p, u, v] = _polar(a)[0]
             if 2 * p + 1 < len(out):
-                out[2 * p + 1, u, v] = np.sqrt(b[0] * b[0] + b[1] * b[1])
+                out[2 * p + 1, u, v] = _polar(b)[0]
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def _difference(value, target):
     """| |F| - T | and the derivative by F, sign(|F| - T) F / |F|, which is 0 where |F| is 0."""
-    size = np.sqrt(value[0] * value[0] + value[1] * value[1])
-    slope = np.sign(size - target) / size if size > 0 else size
-    return abs(size - target), slope * value[0], slope * value[1]
+    size, real, imaginary = _polar(value)
+    sign = np.sign(size - target)
+    return abs(size - target), sign * real, sign * imaginary
 
 
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)

@@ -66,10 +66,11 @@ def ssim(pred: Float[Tensor, "b c h w"], target: Float[Tensor, "b c h w"]) -> Fl
         raise ValueError(f"SSIM needs images of one size, got {tuple(pred.shape)} and {tuple(target.shape)}.")
     dtype = torch.float64 if pred.dtype == torch.float64 else torch.float32
     pred, target = pred.to(dtype), target.to(dtype)
-    if pred.device.type != "cpu" or (pred.requires_grad and target.requires_grad):
-        return _ssim_by_convolution(pred, target)
-    if target.requires_grad:
+    if target.requires_grad and not pred.requires_grad:
         pred, target = target, pred
+    if pred.device.type != "cpu" or target.requires_grad:
+        return _ssim_by_convolution(pred, target)
+    centres = torch.stack([_plane_means(image) for image in (pred, target)]).view(2, -1)
     height, width = pred.shape[-2:]
     rows, columns = _window(height), _window(width)
     # a shorter window is an 11-tap one with zeros around it, over an image with as many zeros around it
@@ -80,7 +81,15 @@ def ssim(pred: Float[Tensor, "b c h w"], target: Float[Tensor, "b c h w"]) -> Fl
     padded = [np.pad(taps, (TAPS - taps.size) // 2) for taps in (rows, columns)]
     from freqgs_plugin.functional.compiled_ssim import CompiledSSIM
 
-    return CompiledSSIM.apply(pred, target, *padded)
+    return CompiledSSIM.apply(pred, target, *padded, centres)
+
+
+def _plane_means(image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c 1 1"]:
+    """What is subtracted from images before SSIM: variances of bright flat ones are differences of large squares.
+
+    The mean of each plane, without gradient; row by row, so that threads do not change its bits.
+    """
+    return image.detach().mean(-1, keepdim=True).mean(-2, keepdim=True)
 
 
 @lru_cache(maxsize=16)
@@ -96,11 +105,14 @@ def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:
     from kornia.filters import filter2d_separable
 
     height, width = x.shape[2:]
+    centre_x, centre_y = _plane_means(x), _plane_means(y)
+    x, y = x - centre_x, y - centre_y
     rows, columns = (torch.as_tensor(_window(side), dtype=x.dtype, device=x.device) for side in (height, width))
     maps = filter2d_separable(torch.cat([x, y, x * x, y * y, x * y]), columns[None], rows[None], padding="valid")
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = maps.chunk(5)
     # rounding must not make a variance negative, or the denominator could vanish
     variances = (mean_xx - mean_x**2).clamp_min(0) + (mean_yy - mean_y**2).clamp_min(0)
-    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
     structure = (2 * (mean_xy - mean_x * mean_y) + C2) / (variances + C2)
+    mean_x, mean_y = mean_x + centre_x, mean_y + centre_y
+    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
     return (luminance * structure).mean()

@@ -50,6 +50,20 @@ class Value:
 
 
 @dataclass(frozen=True)
+class Bounded:
+    """Right at a kink, where the gradient has no one value: a finite value near to the truth, a bounded gradient."""
+
+    gradient: float
+    """greatest norm of the gradient, of any dtype"""
+    value: float = 2e-5
+    """as in `Value`"""
+    exact_value: float = 1e-9
+
+    def __str__(self) -> str:
+        return "value, bounded gradient"
+
+
+@dataclass(frozen=True)
 class Nothing:
     """Right: exactly what an empty scene gives, and gradients that are exactly zero."""
 
@@ -69,6 +83,9 @@ class Refused:
         return self.error.__name__
 
 
+Expected = Value | Bounded | Nothing | Refused
+
+
 @dataclass(frozen=True)
 class Case:
     """One row of the table of cases: one question, put to every backend and dtype."""
@@ -81,7 +98,7 @@ class Case:
     truth: Callable[[Tensors], Sequence[Tensors]] | None
     """the right outputs, differentiable, from float64 inputs. Several where the input lies on a threshold: each element
     may then agree with any of them. None: `compute` in float64 torch"""
-    expected: Value | Nothing | Refused
+    expected: Expected
     settings: tuple[Setting, ...]
     units: Callable[[Tensors], Tensors] = field(default=lambda inputs: {})
     """factors that make a gradient one per natural unit: per pixel, per relative change, per radian"""
@@ -109,7 +126,7 @@ class Row:
     value_error: float | None
     """relative to the output's largest magnitude (at least 1); None where there is no picture to compare"""
     gradient_error: float | None
-    """greatest relative error over all inputs' gradients"""
+    """greatest relative error over all inputs' gradients; None where the truth is a bound"""
     finite: bool
     """all outputs and gradients"""
     milliseconds: float | None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from freqgs_plugin.reports.stability.case import Case, Compute, Nothing, Refused, Row, Setting, Tensors, Value
+from freqgs_plugin.reports.stability.case import Bounded, Case, Compute, Nothing, Refused, Row, Setting, Tensors, Value
 
 TRUTH = Setting("torch", torch.float64)
 LEAST_SHARE = 1e-3
@@ -72,6 +72,10 @@ def measure(case: Case, setting: Setting, answers: Sequence[Evaluated] | None = 
         elif isinstance(expected, Nothing):
             zero = not any(bool(g.any()) for k, g in actual.gradients.items() if k != "background")
             passed = value_error == 0 and zero
+        elif isinstance(expected, Bounded):
+            tolerance = expected.exact_value if setting.dtype == torch.float64 else expected.value
+            largest = max(float(g.norm()) for g in actual.gradients.values())
+            passed, gradient_error = value_error <= tolerance and largest <= expected.gradient, None
     outcome = "not finite" if not finite else "zero" if isinstance(expected, Nothing) and passed else "value"
     return _row(case, setting, outcome, value_error, gradient_error, finite, milliseconds, passed)
 

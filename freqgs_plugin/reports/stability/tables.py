@@ -24,10 +24,11 @@ A cell holds value error, gradient error and time (forward and backward, kernels
   per unit of opacity and of feature). The worst input counts. A gradient under 1/1000 of the largest one counts as
   1/1000.
 * the *truth* is an evaluation in float64 of its own: every Gaussian at every pixel by plain autograd, from a factor of
-  the covariance. For pictures too large for that, torch in float64. Inputs are rounded to float32 first, so that all
-  see the same numbers.
+  the covariance; losses by matrices and windows. For pictures too large for that, torch in float64. Inputs are rounded
+  to float32 first, so that all see the same numbers.
 * the *expected* outcome is `value` (finite, and within the dtype's tolerance), `zero` (exactly what an empty scene
-  gives, and gradients that are exactly zero) or a named error.
+  gives, and gradients that are exactly zero) or a named error. At a kink (a magnitude or a difference of 0) the
+  gradient is right if it is bounded.
 * a case *on a threshold* (alpha 1/255, the cap 0.999, transmittance 1e-4, the near plane) has two right answers, one
   for each side; a picture may agree with either, pixel by pixel.
 """
@@ -87,8 +88,8 @@ def cell(row: Row) -> str:
         parts.append(row.outcome.partition(":")[0] if row.passed else f"**wrong**: {row.outcome}")
     elif row.outcome == "zero":
         parts.append("zero")
-    if row.value_error is not None and row.gradient_error is not None and row.outcome != "zero":
-        parts += [f"{row.value_error:.0e}", f"{row.gradient_error:.0e}"]
+    if row.value_error is not None and row.outcome != "zero":
+        parts += [f"{row.value_error:.0e}", "-" if row.gradient_error is None else f"{row.gradient_error:.0e}"]
     if row.milliseconds is not None:
         parts.append(f"{row.milliseconds:,.1f} ms" if row.milliseconds < 1000 else f"{row.milliseconds / 1000:,.1f} s")
     return ", ".join(parts).replace("|", "/")
