@@ -32,6 +32,12 @@ class FreqSplatModelConfig(SplatfactoModelConfig):
     """Gaussians whose weight over all training views is under this many pixels are removed; 0: none (ours)"""
     least_views: int = 2
     """Gaussians above level 1 that fewer training views show are removed; 0: none (ours)"""
+    opacity_penalty: float = 0.0
+    """weight of the mean opacity in the loss: Gaussians that no picture needs fade and are pruned; 0: none (ours)"""
+    size_penalty: float = 0.0
+    """weight of the mean standard deviation, world units, in the loss; 0: none (ours)"""
+    dropout: float = 0.0
+    """share of Gaussians that each training step leaves out at random, in [0, 1); 0: none (ours)"""
     max_gaussians: int = 0
     """densification stops at this many Gaussians; 0: no bound (ours)"""
     steps_scale: float | None = None

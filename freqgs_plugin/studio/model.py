@@ -1,6 +1,7 @@
 """The base of both methods: how splats are trained, with level tags, densification, a guard and exact resuming."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from freqgs_plugin.studio.targets import TargetCache, ViewTarget
 from freqgs_plugin.studio.viewing import SplatViews, psnr, show
 from freqgs_plugin.training.densify import LevelStrategy
 from freqgs_plugin.training.guard import FiniteGuard, NonFiniteError
+from freqgs_plugin.training.regularise import drop_out, mean_opacity, mean_size
 from freqgs_plugin.training.schedule import REFERENCE_STEPS, Schedule, scaled
 from freqgs_plugin.types import Camera, Gaussians, Rendering
 
@@ -177,7 +179,11 @@ class FreqSplatModel(SplatViews):
         self._begin_step(step)
 
     def _training_outputs(self, camera: Camera, background: Tensor, cam_idx: int | None) -> dict[str, Any]:
-        renderings = self._training_renderings(self.gaussians(), camera, background)
+        gaussians = self.gaussians()
+        if self.config.dropout > 0:
+            kept = drop_out(gaussians.opacities, self.config.dropout, self.config.seed, self.step)
+            gaussians = replace(gaussians, opacities=kept)
+        renderings = self._training_renderings(gaussians, camera, background)
         self._info = renderings[-1].info
         images = [r.features for r in renderings]
         if self.config.use_bilateral_grid and cam_idx is not None:
@@ -301,6 +307,10 @@ class FreqSplatModel(SplatViews):
         losses: dict[str, Any] = self._objective(outputs, self._training_targets(batch, outputs["background"]))
         if self.config.use_scale_regularization and self.step % 10 == 0:
             losses["scale_reg"] = self._scale_regularization()
+        if self.config.opacity_penalty != 0:
+            losses["opacity"] = self.config.opacity_penalty * mean_opacity(self.opacities)
+        if self.config.size_penalty != 0:
+            losses["size"] = self.config.size_penalty * mean_size(self.scales)
         self.camera_optimizer.get_loss_dict(losses)
         if self.config.use_bilateral_grid:
             from nerfstudio.model_components.lib_bilagrid import total_variation_loss

@@ -1,0 +1,30 @@
+"""What keeps a scene small, and right from views that were never seen: penalties on opacity and size, and dropout.
+
+The penalties are those of "3D Gaussian Splatting as Markov Chain Monte Carlo" (Eq. 9): a Gaussian that no picture needs
+fades until it is pruned. Dropout is DropGaussian's: what a few views show is not left to single Gaussians in front.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def mean_opacity(logits: Float[Tensor, "n 1"]) -> Float[Tensor, ""]:
+    """Mean of sigmoid(logits); 0 without Gaussians."""
+    return torch.sigmoid(logits).sum() / max(len(logits), 1)
+
+
+def mean_size(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+    """Mean standard deviation over all axes, world units; 0 without Gaussians."""
+    return torch.exp(log_scales).sum() / max(log_scales.numel(), 1)
+
+
+def drop_out(opacities: Float[Tensor, " n"], rate: float | int, seed: int, step: int) -> Float[Tensor, " n"]:
+    """Opacities with a random share `rate` set to 0 and the others divided by 1 - rate: the mean stays.
+
+    Which ones depends on seed, step and number of Gaussians alone, so a resumed run drops what the whole run would have
+    dropped. Opacities above 1 come out as they are; rasterizers cap alpha.
+    """
+    generator = torch.Generator().manual_seed((seed << 32) + step)
+    kept = torch.rand(len(opacities), generator=generator) >= rate
+    return opacities * kept.to(opacities) / (1.0 - rate)

@@ -1,0 +1,46 @@
+"""Penalties and dropout: closed forms, laws, no Gaussians."""
+
+import pytest
+import torch
+
+from freqgs_plugin.training.regularise import drop_out, mean_opacity, mean_size
+
+
+def test_penalties_are_means_of_what_is_drawn():
+    assert mean_opacity(torch.tensor([[0.0], [torch.logit(torch.tensor(0.9))]])).item() == pytest.approx(0.7)
+    assert mean_size(torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])).item() == pytest.approx((1 + 2.718281828) / 2)
+
+
+def test_penalties_push_opacity_and_size_down():
+    logits, scales = torch.zeros(3, 1, requires_grad=True), torch.zeros(3, 3, requires_grad=True)
+    (mean_opacity(logits) + mean_size(scales)).backward()
+    assert logits.grad is not None and scales.grad is not None
+    assert bool((logits.grad > 0).all()) and bool((scales.grad > 0).all())
+
+
+def test_no_gaussians_cost_nothing():
+    assert mean_opacity(torch.zeros(0, 1)).item() == 0
+    assert mean_size(torch.zeros(0, 3)).item() == 0
+    assert drop_out(torch.zeros(0), 0.5, 1, 2).shape == (0,)
+
+
+def test_dropout_keeps_the_mean_and_the_share():
+    dropped = drop_out(torch.full((100_000,), 0.3), 0.1, seed=1, step=7)
+    assert (dropped == 0).float().mean().item() == pytest.approx(0.1, abs=0.005)
+    assert dropped.mean().item() == pytest.approx(0.3, abs=0.003)
+    assert dropped.max().item() == pytest.approx(0.3 / 0.9)
+
+
+def test_dropout_depends_on_seed_and_step_alone():
+    opacities = torch.rand(1000)
+    torch.manual_seed(0)
+    first = drop_out(opacities, 0.5, seed=1, step=7)
+    torch.manual_seed(99)
+    assert torch.equal(first, drop_out(opacities, 0.5, seed=1, step=7))
+    assert not torch.equal(first, drop_out(opacities, 0.5, seed=1, step=8))
+    assert not torch.equal(first, drop_out(opacities, 0.5, seed=2, step=7))
+
+
+def test_rate_0_changes_nothing():
+    opacities = torch.rand(10)
+    assert torch.equal(drop_out(opacities, 0.0, 0, 0), opacities)
