@@ -4,6 +4,7 @@ The penalties are those of "3D Gaussian Splatting as Markov Chain Monte Carlo" (
 fades until it is pruned. Dropout is DropGaussian's: what a few views show is not left to single Gaussians in front.
 """
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,6 +26,5 @@ def drop_out(opacities: Float[Tensor, " n"], rate: float | int, seed: int, step:
     Which ones depends on seed, step and number of Gaussians alone, so a resumed run drops what the whole run would have
     dropped. Opacities above 1 come out as they are; rasterizers cap alpha.
     """
-    generator = torch.Generator().manual_seed((seed << 32) + step)
-    kept = torch.rand(len(opacities), generator=generator) >= rate
-    return opacities * kept.to(opacities) / (1.0 - rate)
+    kept = np.random.default_rng((seed, step)).random(len(opacities), np.float32) >= rate
+    return opacities * torch.from_numpy(kept).to(opacities) / (1.0 - rate)
