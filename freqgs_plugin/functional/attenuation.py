@@ -87,8 +87,8 @@ class DistanceDecay:
     elsewhere; it falls with `scale` and with distance, and rises with σ. Computed in float32 at least, under autocast
     too. The distance has no gradient: fading must not move Gaussians.
 
-    A dead decay (σ <= 0) has weight 0, except at the camera's centre, and no gradient. A faint Gaussian (α <= τ s) has
-    weight 0 at any distance.
+    A dead decay (σ <= 0) has no gradient, and weight 0 except at the camera's centre (d' s under about 1e-4, where ε
+    counts). A faint Gaussian (α <= τ s) has weight 0 at any distance.
     """
 
     scale: float | int = 1.0

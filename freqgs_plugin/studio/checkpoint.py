@@ -39,7 +39,7 @@ class Run:
         if not isinstance(model, FreqSplatModel):
             raise ValueError(
                 f"the run was trained by '{config.method_name}', whose model is no level-of-detail model. "
-                "Name a config.yml of a lapsplat run."
+                "Name a config.yml of a lapsplat or clodsplat run."
             )
         self.model: FreqSplatModel = model
 
@@ -52,7 +52,12 @@ class Run:
     @property
     def num_levels(self) -> int:
         """Levels L of the scene."""
-        return int(getattr(self.model, "num_levels", 1))
+        return self.model.num_levels
+
+    @property
+    def scene_distance(self) -> float | None:
+        """What `DistanceDecay` divides distances by for the reference `scene`, world units; None without decay."""
+        return getattr(self.model, "scene_distance", None)
 
     @property
     def background(self) -> Float[Tensor, " 3"]:

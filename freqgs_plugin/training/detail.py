@@ -14,8 +14,6 @@ from torch import Tensor
 CountGradient = Literal["none", "ste", "soft"]
 """gradient of the number of drawn Gaussians: `none` (the paper's mask is a step), `ste`: counted exactly, with the
 gradient of a sigmoid; `soft`: the sum of those sigmoids itself"""
-_TEMPERATURE = 0.5
-"""width of the sigmoid, in units of ln(opacity / threshold)"""
 _EXPONENT = 1.5
 """how fast the target share falls with the scale (Eq. 3)"""
 
@@ -57,7 +55,11 @@ def target_share(scale: float | int) -> float:
 
 
 def count_loss(
-    margin: Float[Tensor, " n"], scale: float | int, largest: float | int, gradient: CountGradient = "ste"
+    margin: Float[Tensor, " n"],
+    scale: float | int,
+    largest: float | int,
+    gradient: CountGradient = "ste",
+    temperature: float | int = 0.5,
 ) -> Float[Tensor, ""]:
     """(s_v - 1)^2 max(share drawn - target share, 0)^2, over all Gaussians (Eq. 4); 0 without Gaussians.
 
@@ -69,11 +71,14 @@ def count_loss(
         scale: s_v, at least 1.
         largest: s_max.
         gradient: see `CountGradient`.
+        temperature: width of the sigmoid, in units of `margin`.
     """
     if scale == 1 or not len(margin):
         return margin.sum() * 0.0
     drawn = (margin > 0).to(margin.dtype).mean()
-    soft = torch.sigmoid(margin / _TEMPERATURE).mean()
-    shares = {"none": drawn, "ste": soft + (drawn - soft).detach(), "soft": soft}
+    fades = torch.sigmoid(margin / temperature)
+    # what is not drawn at this scale must not sink further, or it would be missing at smaller ones
+    sinks = torch.where(margin > 0, fades, fades.detach()).mean()
+    shares = {"none": drawn, "ste": sinks + (drawn - sinks).detach(), "soft": fades.mean()}
     weight = (scale - 1.0) ** 2 if gradient == "none" else ((scale - 1.0) / (largest - 1.0)) ** 2
     return weight * torch.relu(shares[gradient] - target_share(scale)).square()

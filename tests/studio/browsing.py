@@ -86,13 +86,14 @@ class Viewer:
 class Page:
     """What a user sees and does on the viewer's page."""
 
-    def __init__(self, browser, port):
+    def __init__(self, browser, port, slider="Level of detail", largest=3):
+        self._largest = largest
         self.page = browser.new_page(viewport=WINDOW)
         # the page asks for a logo on the internet
         local = f"127.0.0.1:{port}"
         self.page.route("**/*", lambda route: route.continue_() if local in route.request.url else route.abort())
         self.page.goto(f"http://{local}")
-        self.page.wait_for_selector("text=Level of detail", timeout=PATIENCE * 1000)
+        self.page.wait_for_selector(f"text={slider}", timeout=PATIENCE * 1000)
 
     def drawn(self):
         """Gaussians drawn, of how many, and the text; None before the first picture."""
@@ -123,8 +124,8 @@ class Page:
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(float)
 
     def slide(self, share):
-        """Drag the level slider's thumb to `share` of its way."""
-        thumb = self.page.locator('[role="slider"][aria-valuemin="1"][aria-valuemax="3"]')
+        """Drag the slider's thumb to `share` of its way."""
+        thumb = self.page.locator(f'[role="slider"][aria-valuemin="1"][aria-valuemax="{self._largest}"]')
         thumb.scroll_into_view_if_needed()
         box = thumb.bounding_box()
         track = thumb.locator("xpath=..").bounding_box()

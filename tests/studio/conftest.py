@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from running import EVERY, SCALE, SIZE, STEPS, command, train_arguments
+from running import DECAY_START, EVERY, SCALE, SIZE, STEPS, command, train_arguments
 
 from freqgs_plugin.demo.dataset import SceneOptions, write_scene
 
@@ -43,6 +43,19 @@ def trained(scene, tmp_path_factory):
     return config
 
 
+@pytest.fixture(scope="session")
+def faded(scene, tmp_path_factory):
+    """config.yml of a finished run of clodsplat, with a checkpoint from before its decay begins and some from after."""
+    output = tmp_path_factory.mktemp("runs")
+    more = ["--max-num-iterations", STEPS, "--steps-per-save", 25, "--save-only-latest-checkpoint", False]
+    more += ["--pipeline.model.decay-start-step", round(DECAY_START / SCALE), "--pipeline.model.export-distance", 0.6]
+    done = command("ns-train", *train_arguments(scene, output, *more, method="clodsplat"))
+    config = output / "small" / "clodsplat" / "run" / "config.yml"
+    assert done.code == 0 and config.is_file(), str(done)
+    (config.parent / "log.txt").write_text(done.text)
+    return config
+
+
 @pytest.fixture
 def said(monkeypatch):
     """What is logged through nerfstudio's console, unwrapped."""
@@ -55,13 +68,13 @@ def said(monkeypatch):
 
 @pytest.fixture
 def make_config(scene, tmp_path):
-    """`make_config(data=scene, parser={}, **model)`: the registered method's configuration for the small scene."""
+    """`make_config(data=scene, parser={}, method="lapsplat", **model)`: a registered method for the small scene."""
 
-    def make(data=None, parser=None, camera_optimizer=None, **model):
+    def make(data=None, parser=None, camera_optimizer=None, method="lapsplat", **model):
         from nerfstudio.configs.method_configs import all_methods
         from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
-        config = copy.deepcopy(all_methods["lapsplat"])
+        config = copy.deepcopy(all_methods[method])
         manager = config.pipeline.datamanager
         manager.dataparser = ColmapDataParserConfig(**{"eval_mode": "interval", "eval_interval": 4, **(parser or {})})
         config.data = manager.data = data or scene
@@ -81,6 +94,8 @@ def make_config(scene, tmp_path):
 @pytest.fixture
 def make_trainer(make_config, monkeypatch):
     """`make_trainer(load_dir=None, ...)`: nerfstudio's own Trainer, set up and ready to step."""
+    # the trainer imports the writer, which cannot be imported before it
+    import nerfstudio.engine.trainer  # noqa: F401
     from nerfstudio.utils import writer
 
     monkeypatch.setattr(writer, "EVENT_WRITERS", [])

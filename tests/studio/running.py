@@ -15,6 +15,8 @@ SCALE = 0.02
 """of step constants: levels begin at steps 50 and 100"""
 EVERY = 20
 """steps between two refinements"""
+DECAY_START = 40
+"""step from which clodsplat's opacities decay"""
 
 
 @dataclass(frozen=True)
@@ -53,9 +55,9 @@ def peak_gigabytes():
     return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
 
 
-def train_arguments(scene, output, *more, timestamp="run"):
+def train_arguments(scene, output, *more, timestamp="run", method="lapsplat"):
     return [
-        *("lapsplat", "--data", scene, "--output-dir", output, "--experiment-name", "small", "--timestamp", timestamp),
+        *(method, "--data", scene, "--output-dir", output, "--experiment-name", "small", "--timestamp", timestamp),
         *("--steps-per-eval-image", "60", "--steps-per-eval-batch", "50", "--steps-per-eval-all-images", "149"),
         *("--pipeline.model.steps-scale", SCALE, "--pipeline.model.least-refine-interval", EVERY),
         *("--vis", "tensorboard"),

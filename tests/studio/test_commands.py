@@ -12,7 +12,7 @@ import pytest
 import torch
 import yaml
 from PIL import Image
-from running import EVERY, SCALE, SIZE, STEPS, advance, command, peak_gigabytes, save, train_arguments
+from running import DECAY_START, EVERY, SCALE, SIZE, STEPS, advance, command, peak_gigabytes, save, train_arguments
 
 pytestmark = pytest.mark.slow
 
@@ -324,3 +324,95 @@ def test_a_run_without_checkpoints(trained, tmp_path):
 def test_config_is_readable(trained):
     config = yaml.load(trained.read_text(), Loader=yaml.Loader)
     assert config.method_name == "lapsplat" and config.pipeline.model.num_levels == 3
+
+
+DETAILS = ("1", "1.5", "2", "3", "5")
+
+
+class TestClodsplat:
+    """The same commands on a run of the other method."""
+
+    def test_training(self, faded):
+        text = re.sub(r"\s+", " ", (faded.parent / "log.txt").read_text())
+        assert f"Step {DECAY_START}: opacities decay with distance from here on." in text
+        before, after = (load(faded, step)["pipeline"] for step in (25, STEPS - 1))
+        assert bool((before["_model.gauss_params.decay"] == 5).all()) and not before["_model._extra_state"]["decays"]
+        assert after["_model._extra_state"]["decays"] and after["_model.gauss_params.decay"].std() > 0.01
+        assert len(after["_model.gauss_params.decay"]) == len(after["_model.level"])
+        events = metrics_of(faded.parent)
+        tags = {f"Train Metrics Dict/{k}" for k in ("scale", "drawn_share", "decay_mean", "dead_decay")}
+        assert tags | {"Train Loss Dict/count"} <= set(events.Tags()["scalars"])
+        assert {e.step >= DECAY_START for e in events.Scalars("Train Metrics Dict/scale")} == {True}
+        loss = [e.value for e in events.Scalars("Train Loss Dict/image_1")]
+        assert np.mean(loss[-3:]) < 0.6 * loss[0], loss
+
+    def test_eval(self, faded, tmp_path):
+        done = command("ns-eval", "--load-config", faded, "--output-path", tmp_path / "eval.json")
+        assert done.code == 0, str(done)
+        results = json.loads((tmp_path / "eval.json").read_text())["results"]
+        kinds = ("psnr", "gaussians", "milliseconds")
+        assert {f"{kind}_detail_{s}" for kind in kinds for s in DETAILS} | {"dead_decay"} <= set(results)
+        assert all(np.isfinite(v) for v in results.values()), results
+        counts = [results[f"gaussians_detail_{s}"] for s in DETAILS]
+        assert counts == sorted(counts, reverse=True) and counts[0] <= results["gaussians"]
+        assert results["psnr_detail_1"] == pytest.approx(results["psnr"], abs=1e-3)
+
+    def test_render(self, faded, tmp_path):
+        names = ["rgb", *(f"detail_{s}" for s in DETAILS), "drawn_share", "decay"]
+        done = command(
+            *("ns-render", "dataset", "--load-config", faded, "--output-path", tmp_path, "--image-format", "png"),
+            *("--rendered-output-names", *names),
+        )
+        assert done.code == 0, str(done)
+        seen = {name: pictures(tmp_path / "test" / name) for name in names}
+        for name, images in seen.items():
+            assert len(images) == 3, name
+            assert all(image.shape == (SIZE[1], SIZE[0], 3) for image in images.values()), name
+        for view, image in seen["rgb"].items():
+            assert np.array_equal(image, seen["detail_1"][view])
+            assert not np.array_equal(image, seen["detail_5"][view])
+
+    def test_camera_path(self, faded, tmp_path, render):
+        path = {
+            "camera_type": "perspective", "render_height": 48, "render_width": 64, "seconds": 1, "fps": 2,
+            "camera_path": [
+                {"camera_to_world": pose(angle).flatten().tolist(), "fov": 50, "aspect": 4 / 3} for angle in (0, 1)
+            ],
+        }  # fmt: skip
+        (tmp_path / "path.json").write_text(json.dumps(path))
+        render(
+            *("camera-path", "--load-config", faded, "--camera-path-filename", tmp_path / "path.json"),
+            *("--output-path", tmp_path / "out.mp4", "--output-format", "images", "--image-format", "png"),
+            *("--rendered-output-names", "detail_2"),
+        )
+        assert all(image.shape == (48, 64, 3) for image in pictures(tmp_path / "out").values())
+
+    def test_export_says_from_where(self, faded, tmp_path):
+        done = command("ns-export", "gaussian-splat", "--load-config", faded, "--output-dir", tmp_path)
+        assert done.code == 0, str(done)
+        assert "opacities are those seen from 0.6 of the scene's distance" in re.sub(r"\s+", " ", done.text)
+        rows = plyfile.PlyData.read(tmp_path / "splat.ply")["vertex"].data
+        state = load(faded, STEPS - 1)["pipeline"]
+        sigma, logits = (state[f"_model.gauss_params.{name}"].flatten().double() for name in ("decay", "opacities"))
+        faint = torch.sigmoid(logits) * torch.exp(-(0.6**2) / (2 * sigma.clamp_min(0) ** 2 + 1e-8))
+        kept = torch.logit(faint.clamp_min(1e-30)) >= -5.5373
+        assert abs(len(rows) - int(kept.sum())) <= 1 and len(rows) > 0
+        assert len(rows) != int(kept.sum()) or np.allclose(rows["opacity"], torch.logit(faint[kept]), atol=1e-4)
+
+    @pytest.mark.parametrize("step", [25, 75])
+    def test_resume(self, faded, scene, tmp_path, step):
+        more = ["--load-dir", checkpoints(faded), "--load-step", step, "--max-num-iterations", STEPS - 1 - step]
+        more += ["--pipeline.model.decay-start-step", round(DECAY_START / SCALE)]
+        done = command("ns-train", *train_arguments(scene, tmp_path, *more, timestamp="again", method="clodsplat"))
+        assert done.code == 0, str(done)
+        text = re.sub(r"\s+", " ", done.text)
+        assert (f"Step {DECAY_START}: opacities decay" in text) == (step < DECAY_START)
+        state = load(tmp_path / "small" / "clodsplat" / "again" / "config.yml", STEPS - 1)["pipeline"]
+        assert state["_model._extra_state"]["decays"] and len(state["_model.gauss_params.decay"]) > 1
+
+    def test_as_plain_gaussians(self, faded):
+        from freqgs_plugin.studio.checkpoint import load_run
+
+        run = load_run(faded)
+        assert run.gaussians.decay is not None and run.gaussians.decay.shape == (len(run.gaussians),)
+        assert run.scene_distance == run.model.scene_distance and run.num_levels == 1
