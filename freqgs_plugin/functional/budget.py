@@ -32,6 +32,8 @@ from freqgs_plugin.types import Camera, Gaussians
 TIE = 2e-6
 """cut-offs that differ by a smaller share count as equal: float32 cannot tell on which side of them a scale is"""
 _FEW = 4096
+_FADE = 0.25
+"""Gaussians fade in between 1 and this much more than 1 times the measure at which they are left out"""
 _BLUR = 0.3 + 0.1
 """px^2: the rasterizers' blur, and the floor of gsplat's eigenvalue"""
 
@@ -62,9 +64,10 @@ class LevelFit:
 
 @dataclass(frozen=True)
 class DecayBudget:
-    """`DistanceDecay` at the smallest scale of at least `least` that draws at most `count` Gaussians of a view.
+    """`DistanceDecay` at the smallest scale in `least`..`largest` that draws at most `count` Gaussians of a view.
 
-    Gaussians out of view have weight 0. See `decay_scale` for ties.
+    Where `largest` draws more than `count`, and where several vanish at once (see `decay_scale`), those that show most
+    stay, as in `LevelBudget`. Gaussians out of view have weight 0.
     """
 
     count: float | int
@@ -75,19 +78,24 @@ class DecayBudget:
     """as in `DistanceDecay`"""
     least: float | int = 1.0
     """the scale is never smaller: what a detail slider asks for"""
+    largest: float | int = math.inf
+    """the scale is never larger, unless `least` is: what the scene was trained for. Beyond, all of it fades away"""
 
     def __post_init__(self) -> None:
         _whole(self.count)
         DistanceDecay(self.least, self.reference, self.scene_distance)
+        if not self.largest > 0:
+            raise ValueError(f"the largest scale is {self.largest}; it must be > 0 (inf: no bound).")
 
-    def fit(self, gaussians: Gaussians, camera: Camera) -> Fit:
-        """The scale for one view."""
-        return decay_scale(gaussians, camera, self.count, self.reference, self.scene_distance, self.least)
+    def scale(self, gaussians: Gaussians, camera: Camera) -> float:
+        """s_v for one view."""
+        fit = decay_scale(gaussians, camera, self.count, self.reference, self.scene_distance, self.least)
+        return max(min(fit.scale, float(self.largest)), float(self.least))
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
-        scale = self.fit(gaussians, camera).scale
-        weight = DistanceDecay(scale, self.reference, self.scene_distance, self.soft)(gaussians, camera)
-        return weight * in_view(gaussians, camera)
+        decay = DistanceDecay(self.scale(gaussians, camera), self.reference, self.scene_distance, self.soft)
+        weight = decay(gaussians, camera) * in_view(gaussians, camera)
+        return _most_visible(gaussians, weight, camera, int(self.count), self.soft)
 
 
 @dataclass(frozen=True)
@@ -95,9 +103,9 @@ class LevelBudget:
     """Whole levels as long as they fit into `count` Gaussians of a view, then the part of the next one that shows most.
 
     `LevelCut` at a fraction would draw all of the next level, faded; a budget has to leave some out. Those with the
-    largest opacity times area on the screen stay. They fade in between 1 and 2 times the measure at which they are left
-    out, so that nothing pops as the camera moves. Where not even level 1 fits, it is the one that is drawn in part.
-    Gaussians out of view have weight 0.
+    largest opacity times area on the screen stay. They fade in between 1 and 1.25 times the measure at which they are
+    left out, so that nothing pops as the camera moves. Where not even level 1 fits, it is drawn in part. Gaussians out
+    of view have weight 0.
     """
 
     count: float | int
@@ -138,18 +146,8 @@ class LevelBudget:
         self, gaussians: Gaussians, camera: Camera, seen: Bool[Tensor, " n"], level: int, count: int
     ) -> Float[Tensor, " n"]:
         """Weights of the `count` Gaussians of `level` in view that show most."""
-        weight = torch.zeros_like(gaussians.opacities)
-        rows = torch.where(seen & (gaussians.level == level))[0]
-        if count == 0:
-            return weight
-        measure = _visibility(gaussians.select(rows), camera)
-        cut = measure.kthvalue(len(rows) - count).values
-        if self.soft:
-            fade = (measure / cut.clamp_min(torch.finfo(measure.dtype).tiny) - 1.0).clamp(0.0, 1.0)
-            weight[rows] = fade * fade * (3.0 - 2.0 * fade)
-        else:
-            weight[rows] = (measure > cut).to(weight.dtype)
-        return weight
+        weight = (seen & (gaussians.level == level)).to(gaussians.opacities.dtype)
+        return _most_visible(gaussians, weight, camera, count, self.soft)
 
 
 def decay_scale(
@@ -294,6 +292,28 @@ def _two_cutoffs(a: Float[Tensor, " n"], b: Float[Tensor, " n"], count: int, low
     rows = (torch.sub(b, a, alpha=math.exp(2 * low)) > low) & (torch.sub(b, a, alpha=math.exp(2 * high)) <= high)
     cutoffs = _solve(a[rows], b[rows]).sort(descending=True).values
     return float(cutoffs[count - above_high - 1]), float(cutoffs[count - above_high])
+
+
+def _most_visible(
+    gaussians: Gaussians, weight: Float[Tensor, " n"], camera: Camera, count: int, soft: bool
+) -> Float[Tensor, " n"]:
+    """`weight` of the at most `count` Gaussians that show most, 0 of others; it is returned where so few have any."""
+    rows = torch.where(weight > 0)[0]
+    if len(rows) <= count:
+        return weight
+    out = torch.zeros_like(weight)
+    if count == 0:
+        return out
+    shown = weight[rows]
+    measure = _visibility(gaussians.select(rows), camera) * shown.detach()
+    cut = measure.kthvalue(len(rows) - count).values
+    if soft:
+        excess = measure / cut.clamp_min(torch.finfo(measure.dtype).tiny) - 1.0
+        fade = (excess / _FADE).clamp(0.0, 1.0)
+        out[rows] = shown * fade * fade * (3.0 - 2.0 * fade)
+    else:
+        out[rows] = shown * (measure > cut)
+    return out
 
 
 def _visibility(gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:

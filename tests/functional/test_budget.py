@@ -289,6 +289,46 @@ def test_decay_budget_draws_the_count_and_nothing_out_of_view(soft):
     assert torch.equal(weight, expected * in_view(scene, CAMERA))
 
 
+@pytest.mark.parametrize("largest", [1.0, 1.5, 3.0])
+@pytest.mark.parametrize("soft", [True, False])
+def test_beyond_the_largest_scale_those_that_show_most_stay(largest, soft):
+    scene = gaussians(4000)
+    at_largest = DistanceDecay(largest, "frustum_max", soft=soft)(scene, CAMERA) * in_view(scene, CAMERA)
+    fits = int((at_largest > 0).sum())
+    kept = DecayBudget(fits, "frustum_max", soft=soft, largest=largest)
+    assert kept.scale(scene, CAMERA) <= largest and torch.equal(kept(scene, CAMERA) > 0, at_largest > 0)
+    fewer = DecayBudget(fits // 3, "frustum_max", soft=soft, largest=largest)
+    weight = fewer(scene, CAMERA)
+    assert fewer.scale(scene, CAMERA) == largest and int((weight > 0).sum()) == fits // 3
+    assert (weight <= at_largest).all()
+    area = scene.scales.sort(-1).values[:, 1:].prod(-1) / scene.means[:, 2].square()
+    shows = scene.opacities * at_largest * area
+    assert shows[weight > 0].min() > shows[(weight == 0) & (at_largest > 0)].max()
+    if not soft:
+        assert torch.equal(weight[weight > 0], at_largest[weight > 0])
+
+
+def test_a_slider_beyond_the_largest_scale_counts():
+    budgeted = DecayBudget(10**6, "frustum_max", least=7.0, largest=3.0)
+    assert budgeted.scale(gaussians(), CAMERA) == 7.0
+
+
+@pytest.mark.parametrize("largest", [0.0, -1.0, math.nan])
+def test_a_largest_scale_that_is_none(largest):
+    with pytest.raises(ValueError, match="the largest scale is"):
+        DecayBudget(5, "frustum_max", largest=largest)
+
+
+def test_a_tie_does_not_break_an_attenuations_budget():
+    scene = gaussians(300)
+    one = scene.select(in_view(scene, CAMERA)).select(torch.arange(1))
+    g = torch.Generator().manual_seed(0)
+    same = Gaussians(**{key: getattr(one, key).repeat_interleave(9, 0) for key in KEYS})
+    same = replace(same, opacities=torch.full((9,), 0.9), decay=torch.full((9,), 4.0))
+    same = replace(same, scales=same.scales * (1 + torch.rand(9, 1, generator=g)))
+    assert int((DecayBudget(4, "frustum_max")(same, CAMERA) > 0).sum()) == 4
+
+
 def in_view_by_level(scene):
     return torch.bincount(scene.level[in_view(scene, CAMERA)])[1:].tolist()
 
