@@ -17,12 +17,11 @@ from torch import Tensor
 
 from freqgs_plugin.functional.harmonics import MAX_DEGREE, num_coefficients
 from freqgs_plugin.functional.similarity import Similarity
-from freqgs_plugin.io.parameters import RawGaussians
+from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.ply import SplatFileError, read_ply
 
 TRANSFORMS = "dataparser_transforms.json"
 _CHECKPOINTS = "nerfstudio_models"
-_GROUPS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
 _PREFIX = "_model.gauss_params."
 _OLD_PREFIX = "_model."
 """of splatfacto before nerfstudio 1.0"""
@@ -153,14 +152,14 @@ def _read_checkpoint(path: Path) -> tuple[RawGaussians, int]:
     # distributed training puts `module.` into the names
     tensors = {name.replace("module.", ""): value for name, value in content["pipeline"].items()}
     prefix = _PREFIX if f"{_PREFIX}means" in tensors else _OLD_PREFIX
-    missing = [name for name in _GROUPS if not isinstance(tensors.get(prefix + name), Tensor)]
+    missing = [name for name in GROUPS if not isinstance(tensors.get(prefix + name), Tensor)]
     if missing:
         some = ", ".join(sorted(tensors)[:3]) or "nothing"
         raise SplatFileError(
             f"{path} holds no Gaussians: it lacks {', '.join(missing)}, and has {some} ... "
             "Name a run of splatfacto, lapsplat or clodsplat."
         )
-    known = {*_GROUPS, "decay"}
+    known = {*GROUPS, "decay"}
     other = [name.removeprefix(_PREFIX) for name in tensors if name.startswith(_PREFIX)]
     other = sorted(set(other) - known)
     if other:
@@ -169,7 +168,7 @@ def _read_checkpoint(path: Path) -> tuple[RawGaussians, int]:
             "Export a 3DGS PLY with that method's own commands, and start from it."
         )
     level, decay = tensors.get("_model.level"), tensors.get(f"{_PREFIX}decay")
-    raw = _shaped(path, {name: tensors[prefix + name] for name in _GROUPS}, level, decay)
+    raw = _shaped(path, {name: tensors[prefix + name] for name in GROUPS}, level, decay)
     _check_values(path, raw)
     return raw, int(content.get("step", 0))
 
@@ -239,7 +238,7 @@ def _shaped(path: Path, tensors: dict[str, Tensor], level: Any, decay: Any) -> R
 
 
 def _check_values(path: Path, raw: RawGaussians) -> None:
-    for name in (*_GROUPS, "decay"):
+    for name in (*GROUPS, "decay"):
         value = getattr(raw, name)
         bad = 0 if value is None else int((~torch.isfinite(value)).reshape(len(raw), -1).any(-1).sum())
         if bad:

@@ -9,6 +9,9 @@ from torch import Tensor
 from freqgs_plugin.functional.harmonics import num_coefficients
 from freqgs_plugin.functional.similarity import Similarity
 
+GROUPS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
+"""splatfacto's parameter groups"""
+
 
 @dataclass(frozen=True)
 class RawGaussians:
