@@ -54,6 +54,12 @@ def reduce(image: Float[Tensor, "b c h w"], times: int = 1) -> Float[Tensor, "b 
     kernel but then resamples bilinearly to floor(side / 2), which is a different (and wider) filter.
     """
     channels = image.shape[1]
+    if image.device.type == "cpu" and image.dtype in (torch.float32, torch.float64) and image.numel():
+        from freqgs_plugin.functional.compiled_pyramid import CompiledReduce
+
+        for _ in range(times):
+            image = CompiledReduce.apply(image)  # pyright: ignore[reportAssignmentType]
+        return image
     for _ in range(times):
         # one strided 5x5 depthwise convolution: on CPU a third of the time of blurring everything and then slicing
         image = F.conv2d(_mirror(image), _kernel(image), stride=2, groups=channels)
