@@ -191,9 +191,12 @@ def _distances(gaussians: Gaussians, camera: Camera) -> tuple[Float[Tensor, " n"
 def _frustum_distance(
     distance: Float[Tensor, " n"], in_frustum: Bool[Tensor, " n"], reference: Reference
 ) -> Float[Tensor, ""]:
-    shown = distance[in_frustum] if bool(in_frustum.any()) else distance
+    if not bool(in_frustum.any()):
+        in_frustum = torch.ones_like(in_frustum)
     if reference == "frustum_max":
-        return shown.max()
+        # distances are not negative
+        return distance.masked_fill(~in_frustum, 0.0).max()
+    shown = distance[in_frustum]
     return shown.kthvalue(math.ceil(_QUANTILE * len(shown))).values
 
 
