@@ -105,6 +105,7 @@ def check_inputs(splats: Splats, camera: Camera) -> None:
 
     Raises:
         ValueError: a number that is not finite, an image without pixels, or a focal length that is not positive.
+        TypeError: tensors of several dtypes.
     """
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"camera is {camera.width}x{camera.height} px; both sides must be at least 1.")
@@ -119,6 +120,8 @@ def check_inputs(splats: Splats, camera: Camera) -> None:
         raise ValueError(f"focal lengths are {focal[0]:g} and {focal[1]:g} px; both must be > 0.")
     for name in ("means", "quats", "scales", "opacities", "features"):
         values: Tensor = getattr(splats, name).detach()
+        if values.dtype != splats.means.dtype:
+            raise TypeError(f"{name} are {values.dtype} but means are {splats.means.dtype}; give all one dtype.")
         # one pass without a mask; a finite sum has finite terms only
         if math.isfinite(float(values.sum(dtype=_sum_dtype(values)))):
             continue

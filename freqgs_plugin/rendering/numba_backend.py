@@ -67,20 +67,25 @@ def _feature_groups(features: Tensor) -> list[Any]:
 
 
 class _Composite(torch.autograd.Function):
-    """(splats, means2d probe, view matrix) -> features [prefixes, h, w, d], light [prefixes, h, w], depth [h, w]."""
+    """(splats, means2d probe, view matrix, background [d]) -> features [prefixes, h, w, d] over the background, light
+    [prefixes, h, w], depth [h, w].
+    """
 
     @staticmethod
     def forward(
-        ctx, means, quats, scales, opacities, features, means2d, viewmat, view: _View, depths, with_depth, probe
-    ):
+        ctx, means, quats, scales, opacities, features, means2d, viewmat, background, view: _View, depths, with_depth,
+        probe,
+    ):  # fmt: skip
         shape = (view.prefixes, view.height, view.width)
         light, depth = torch.empty(shape), torch.zeros(shape[1:])
         images = []
+        backgrounds = _feature_groups(background[None])
         for number, group in enumerate(_feature_groups(features)):
             image = torch.empty(*shape, _CHANNELS)
             composite(
                 *view.lists[:3], view.splats, _array(depths), view.level, view.prefixes, group,
-                with_depth and number == 0, view.width, view.height, image.numpy(), light.numpy(), depth.numpy(),
+                backgrounds[number][0], with_depth and number == 0, view.width, view.height,
+                image.numpy(), light.numpy(), depth.numpy(),
             )  # fmt: skip
             images.append(image)
         ctx.save_for_backward(means, quats, scales, opacities, features, light, *images)
@@ -125,10 +130,11 @@ class _Composite(torch.autograd.Function):
         if ctx.needs_input_grad[6]:
             rows = total["view"].double().sum(0).float()
             v_pose = torch.cat([torch.cat([rows[:9].view(3, 3), rows[9:, None]], 1), torch.zeros(1, 4)])
+        v_background = (v_features * light[..., None]).sum((0, 1, 2)) if ctx.needs_input_grad[7] else None
         v_all = torch.cat(v_feature_groups, 1) if len(v_feature_groups) > 1 else v_feature_groups[0]
         return (
             total["means"], total["quats"], total["scales"], total["opacity"][:, 0], v_all[:, :d], total["xy"][None],
-            v_pose, None, None, None, None,
+            v_pose, v_background, None, None, None, None,
         )  # fmt: skip
 
 
@@ -206,14 +212,16 @@ class NumbaRasterizer:
             t.requires_grad for t in (splats.means, splats.quats, splats.scales, splats.opacities, splats.features)
         )
         means2d.requires_grad_(wants_grad)
+        behind = splats.features.new_zeros(1) if background is None else background.to(splats.features)
+        behind = behind.expand(splats.features.shape[1])
         features, light, z = _Composite.apply(
             splats.means, splats.quats, splats.scales, splats.opacities, splats.features, means2d, camera.viewmat,
-            view, depths, depth, means2d if wants_grad and self.absgrad else None,
+            behind, view, depths, depth, means2d if wants_grad and self.absgrad else None,
         )  # fmt: skip
-        if background is not None:
-            features = features + light[..., None] * background
         alpha = 1 - light[..., None]
-        expected = torch.where(alpha[0] > 0, z[..., None] / alpha[0].clamp_min(1e-10), 0.0).detach()
+        expected = z[..., None]
+        if depth:
+            expected = torch.where(alpha[0] > 0, expected / alpha[0].clamp_min(1e-10), 0.0).detach()
         info = {
             "camera_ids": None,
             "gaussian_ids": None,

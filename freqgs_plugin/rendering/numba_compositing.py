@@ -138,9 +138,12 @@ def _unfinished_rows(scratch, prefixes, block):
 
 @njit(parallel=True, fastmath=_FAST, error_model="numpy", cache=True)
 def composite(
-    offsets, ids, boxes, splats, depths, level, prefixes, features, with_depth, width, height, image, light, depth
-):
+    offsets, ids, boxes, splats, depths, level, prefixes, features, background, with_depth, width, height,
+    image, light, depth,
+):  # fmt: skip
     """Fill `image` [prefixes, h, w, 3], `light` (final transmittance) [prefixes, h, w] and, if asked, `depth` [h, w].
+
+    `background` [3] fills what light is left.
 
     `level` [n] in 1..prefixes, or None: all belong to a single prefix. Depth needs one prefix.
     """
@@ -192,10 +195,11 @@ def composite(
                 for x in range(min(TILE, width - tx * TILE)):
                     p = _pixel(x, row)
                     y, c = ty * TILE + row, tx * TILE + x
-                    image[k, y, c, 0] = block[p + F0 * PIXELS]
-                    image[k, y, c, 1] = block[p + F1 * PIXELS]
-                    image[k, y, c, 2] = block[p + F2 * PIXELS]
-                    light[k, y, c] = abs(block[p + LIGHT * PIXELS])
+                    left_over = abs(block[p + LIGHT * PIXELS])
+                    image[k, y, c, 0] = block[p + F0 * PIXELS] + left_over * background[0]
+                    image[k, y, c, 1] = block[p + F1 * PIXELS] + left_over * background[1]
+                    image[k, y, c, 2] = block[p + F2 * PIXELS] + left_over * background[2]
+                    light[k, y, c] = left_over
                     if with_depth:
                         depth[y, c] = block[p + DEPTH * PIXELS]
 

@@ -85,7 +85,8 @@ class _Composite(torch.autograd.Function):
     def forward(ctx, means2d, conics, opacities, features, cov_yy, depths, tiles, size, absgrad):
         table = splat_table(means2d[0], conics, opacities, cov_yy)
         composited = features if depths is None else torch.cat([features, depths[:, None]], dim=-1)
-        image, transmittance, used = forward_tiles(table, composited, tiles)
+        with torch.autocast(means2d.device.type, enabled=False):
+            image, transmittance, used = forward_tiles(table, composited, tiles)
         d = features.shape[1]
         ctx.save_for_backward(means2d, conics, opacities, features, transmittance, used)
         ctx.table, ctx.tiles, ctx.absgrad, ctx.image = table, tiles, absgrad, image[:, :d]
@@ -103,7 +104,8 @@ class _Composite(torch.autograd.Function):
         tiles, d = ctx.tiles, features.shape[1]
         grad = tiles.split(grad_features)
         behind = (grad * ctx.image).sum(1, keepdim=True) + transmittance * tiles.split(grad_transmittance)
-        sums = backward_tiles(ctx.table, features, tiles, used, grad, behind[:, 0], ctx.absgrad)
+        with torch.autocast(means2d.device.type, enabled=False):
+            sums = backward_tiles(ctx.table, features, tiles, used, grad, behind[:, 0], ctx.absgrad)
         moments = sums[:, d : d + 6]
         v_means2d, v_conics = conic_gradients(moments, ctx.table)
         if ctx.absgrad:

@@ -294,3 +294,20 @@ def test_equals_the_recorded_images(rasterizer, path, assert_close):
     assert_close(rendering.features, torch.from_numpy(recorded["image"]), loosen=loosen)
     assert_close(rendering.alpha, torch.from_numpy(recorded["alpha"]), loosen=loosen)
     assert_close(rendering.depth, torch.from_numpy(recorded["depth"]), loosen=loosen * 5)
+
+
+def test_gradient_of_the_background_is_the_light_left_over():
+    splats, camera = scenes.splats(dtype=torch.float32), scenes.camera(dtype=torch.float32)
+    background = torch.tensor([0.2, 0.4, 0.9], requires_grad=True)
+    rendering = get_rasterizer("numba", "cpu")(splats, camera, background=background)
+    rendering.features[..., 1].sum().backward()
+    assert background.grad is not None
+    assert 0.01 < (1 - rendering.alpha).mean().item() < 0.99
+    left = (1 - rendering.alpha).sum().item()
+    torch.testing.assert_close(background.grad, torch.tensor([0.0, left, 0.0]), rtol=1e-4, atol=1e-4)
+
+
+def test_a_background_of_another_width_is_refused():
+    splats, camera = scenes.splats(dtype=torch.float32), scenes.camera(dtype=torch.float32)
+    with pytest.raises(RuntimeError, match="expand"):
+        get_rasterizer("numba", "cpu")(splats, camera, background=torch.ones(4))
