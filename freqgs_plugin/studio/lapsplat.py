@@ -52,7 +52,13 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """lambda_k of the image term for prefixes k < m (Eq. 12; ours, the paper: 0.1); 0 leaves them out"""
     growth: Growth = "newest"
     """which Gaussians may grow: all (the paper), the newest level's (ours), or each level from its own_prefix"""
-    densify_grad_thresh: float = 0.0006
+    dropout: float = 0.1
+    """share of Gaussians that each training step leaves out at random, in [0, 1); 0: none (ours)"""
+    opacity_penalty: float = 0.01
+    """weight of the mean opacity in the loss: Gaussians that no picture needs fade and are pruned; 0: none (ours)"""
+    size_penalty: float = 0.01
+    """weight of the mean standard deviation, world units, in the loss; 0: none (ours)"""
+    densify_grad_thresh: float = 0.0004
     """2D gradient, in units of half the image, above which a Gaussian grows (ours; splatfacto: 0.0008)"""
     coarse_growth_factor: float = 1.8
     """densification threshold is multiplied by this for each level below the finest (ours; the paper: 1)"""
