@@ -66,9 +66,9 @@ class Camera:
 
     @property
     def centre(self) -> Float[Tensor, " 3"]:
-        """Camera centre in the world."""
+        """Camera centre in the world, -R^T t; no matrix product, which autocast would take in half precision."""
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
-        return -rotation.T @ translation
+        return -(rotation * translation[:, None]).sum(0)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from freqgs_plugin.functional.projection import working_dtype
+
 MAX_DEGREE = 4
 C0 = 0.28209479177387814
 """the constant basis function, sqrt(1 / 4 pi)"""
@@ -72,7 +74,8 @@ def evaluate(sh: Float[Tensor, "n k 3"], offsets: Float[Tensor, "n 3"]) -> Float
 def evaluate_in_torch(sh: Float[Tensor, "n k 3"], offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """`evaluate` on any device and in any dtype."""
     degree = round(sh.shape[1] ** 0.5) - 1
-    directions = torch.nn.functional.normalize(offsets, dim=-1)
+    # squares of far offsets overflow in float32
+    directions = torch.nn.functional.normalize(offsets.to(working_dtype(offsets)), dim=-1).to(offsets)
     return (basis(directions, degree)[:, :, None] * sh).sum(1)
 
 

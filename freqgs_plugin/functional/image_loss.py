@@ -108,7 +108,9 @@ def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:
     centre_x, centre_y = _plane_means(x), _plane_means(y)
     x, y = x - centre_x, y - centre_y
     rows, columns = (torch.as_tensor(_window(side), dtype=x.dtype, device=x.device) for side in (height, width))
-    maps = filter2d_separable(torch.cat([x, y, x * x, y * y, x * y]), columns[None], rows[None], padding="valid")
+    # variances are differences of blurred squares: half precision would leave nothing of them
+    with torch.autocast(x.device.type, enabled=False):
+        maps = filter2d_separable(torch.cat([x, y, x * x, y * y, x * y]), columns[None], rows[None], padding="valid")
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = maps.chunk(5)
     # rounding must not make a variance negative, or the denominator could vanish
     variances = (mean_xx - mean_x**2).clamp_min(0) + (mean_yy - mean_y**2).clamp_min(0)

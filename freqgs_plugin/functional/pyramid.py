@@ -53,16 +53,20 @@ def reduce(image: Float[Tensor, "b c h w"], times: int = 1) -> Float[Tensor, "b 
     the edge. Values and sizes are those of OpenCV's `pyrDown` at every size; kornia's `pyrdown` blurs with the same
     kernel but then resamples bilinearly to floor(side / 2), which is a different (and wider) filter.
     """
-    channels = image.shape[1]
     if image.device.type == "cpu" and image.dtype in (torch.float32, torch.float64) and image.numel():
         from freqgs_plugin.functional.compiled_pyramid import CompiledReduce
 
         for _ in range(times):
             image = CompiledReduce.apply(image)  # pyright: ignore[reportAssignmentType]
         return image
+    return reduce_by_convolution(image, times)
+
+
+def reduce_by_convolution(image: Float[Tensor, "b c h w"], times: int = 1) -> Float[Tensor, "b c h2 w2"]:
+    """`reduce` on any device and in any dtype."""
     for _ in range(times):
         # one strided 5x5 depthwise convolution: on CPU a third of the time of blurring everything and then slicing
-        image = F.conv2d(_mirror(image), _kernel(image), stride=2, groups=channels)
+        image = _convolve(_mirror(image), _kernel(image), stride=2, groups=image.shape[1])
     return image
 
 
@@ -80,7 +84,7 @@ def expand(image: Float[Tensor, "b c h2 w2"], size: tuple[int, int]) -> Float[Te
     spread[..., ::2, ::2] = image
     # half of the taps of an axis fall on zeros, except where a side of 1 is its own mirror image
     gain = (2 if height > 1 else 1) * (2 if width > 1 else 1)
-    return F.conv2d(_mirror(spread), gain * _kernel(image), groups=image.shape[1])
+    return _convolve(_mirror(spread), gain * _kernel(image), groups=image.shape[1])
 
 
 def laplacian(image: Float[Tensor, "b c h w"], levels: int) -> list[Float[Tensor, "b c _ _"]]:
@@ -109,6 +113,12 @@ def collapse(bands: list[Float[Tensor, "b c _ _"]]) -> Float[Tensor, "b c h w"]:
 def max_levels(height: int, width: int, min_side: int = 16) -> int:
     """The most levels L with min(height, width) / 2^(L-1) >= `min_side` pixels; at least 1."""
     return max(1, (min(height, width) // min_side).bit_length())
+
+
+def _convolve(image: Tensor, kernel: Tensor, **options: int) -> Tensor:
+    """`conv2d` in the dtype of the image, under autocast too: bands are small differences."""
+    with torch.autocast(image.device.type, enabled=False):
+        return F.conv2d(image, kernel, **options)  # pyright: ignore
 
 
 def _mirror(image: Tensor) -> Tensor:

@@ -30,7 +30,9 @@ def to_camera(camera: Cameras, camera_to_world: Float[Tensor, "1 3 4"] | None = 
         )
     pose = camera.camera_to_worlds if camera_to_world is None else camera_to_world
     rotation = pose[0, :3, :3] * pose.new_tensor([1.0, -1.0, -1.0])
-    viewmat = torch.cat([rotation.T, -rotation.T @ pose[0, :3, 3:4]], 1)
+    # no matrix product: autocast would take it in half precision
+    translation = -(rotation * pose[0, :3, 3:4]).sum(0)
+    viewmat = torch.cat([rotation.T, translation[:, None]], 1)
     viewmat = torch.cat([viewmat, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
     factor = 2**halvings
     fx, fy, cx, cy = (float(v) / factor for v in (camera.fx, camera.fy, camera.cx, camera.cy))

@@ -96,6 +96,14 @@ def test_impossible_cameras_are_refused(backend, change, message):
         get_rasterizer(backend, "cpu")(splats, replace(camera, **change))
 
 
+@pytest.mark.parametrize("name", ["quats", "scales", "opacities", "features"])
+def test_tensors_of_several_dtypes_are_refused(name):
+    splats = scenes.splats(dtype=torch.float32)
+    splats = scenes.replace(splats, **{name: getattr(splats, name).bfloat16()})
+    with pytest.raises(TypeError, match=f"{name} are torch.bfloat16 but means are torch.float32; give all one dtype"):
+        get_rasterizer("torch", "cpu")(splats, scenes.camera(dtype=torch.float32))
+
+
 def test_the_projections_constants_are_the_seams():
     assert projection.NEAR_PLANE == base.NEAR_PLANE
     assert projection.FOV_MARGIN == base.FOV_MARGIN

@@ -73,3 +73,14 @@ def test_several_cameras_are_refused():
 def test_other_projections_are_refused(kind):
     with pytest.raises(ValueError, match=f"{kind.name} is not supported.*image_undistorter"):
         to_camera(cameras(torch.eye(4)[None, :3], kind=kind))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_autocast_leaves_poses_and_centres_in_float32(dtype):
+    pose = random_pose(torch.Generator().manual_seed(0))
+    expected = to_camera(cameras(pose))
+    with torch.autocast("cpu", dtype=dtype):
+        ours = to_camera(cameras(pose))
+        centre = ours.centre
+    assert torch.equal(ours.viewmat, expected.viewmat) and ours.viewmat.dtype == torch.float32
+    assert torch.equal(centre, expected.centre) and centre.dtype == torch.float32

@@ -104,6 +104,8 @@ class Case:
     """factors that make a gradient one per natural unit: per pixel, per relative change, per radian"""
     fixed: frozenset[str] = frozenset()
     """inputs that need no gradient"""
+    autocast: torch.dtype | None = None
+    """half precision that forward and backward are asked to use, but not the truth"""
     large: bool = False
     """too long for the tests"""
 

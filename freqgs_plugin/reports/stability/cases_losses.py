@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from freqgs_plugin.functional.image_loss import image_distance, ssim
-from freqgs_plugin.functional.pyramid import collapse, laplacian, low_pass, reduce
+from freqgs_plugin.functional.pyramid import collapse, laplacian, low_pass, reduce, reduce_by_convolution
 from freqgs_plugin.functional.spectrum import magnitude, magnitude_distance_to
 from freqgs_plugin.reports.stability import plain
 from freqgs_plugin.reports.stability.case import Bounded, Case, Compute, Setting, Tensors, Value
@@ -155,29 +155,40 @@ def _pyramids() -> list[Case]:
 
         return f
 
-    def case(name: str, function: Callable[[Tensor], Tensor], truth: Callable[[Tensor], Tensor]) -> Case:
+    def case(
+        name: str,
+        truth: Callable[[Tensor], Tensor],
+        in_torch: Callable[[Tensor], Tensor] | None,
+        compiled: Callable[[Tensor], Tensor] | None = None,
+    ) -> Case:
+        functions = {"torch": in_torch, "numba": compiled}
+
+        def compute(setting: Setting) -> Compute:
+            function = functions[setting.backend]
+            assert function is not None
+            return all_sizes(function)
+
         return Case(
             group="losses",
             name=name,
             inputs=lambda: {"image": noise(65, 65, channels=1)},
-            compute=lambda setting: all_sizes(function),
+            compute=compute,
             truth=lambda leaves: [all_sizes(truth)(leaves)],
             expected=Value(),
-            settings=TORCH,
+            settings=tuple(s for s in TORCH + COMPILED if functions[s.backend] is not None),
         )
 
+    def thrice(x: Tensor) -> Tensor:
+        return plain.reduce(plain.reduce(plain.reduce(x)))
+
+    def there_and_back(x: Tensor) -> Tensor:
+        return collapse(laplacian(x, 4))
+
+    by_convolution = reduce_by_convolution
     return [
-        case(
-            "collapse of a Laplacian pyramid of 4 levels, sizes 1..65",
-            lambda x: collapse(laplacian(x, 4)),
-            lambda x: 1 * x,
-        ),
-        case("REDUCE, sizes 1..65", reduce, plain.reduce),
-        case(
-            "REDUCE three times, sizes 1..65",
-            lambda x: reduce(x, 3),
-            lambda x: plain.reduce(plain.reduce(plain.reduce(x))),
-        ),
-        case("low-pass, sizes 1..65", lambda x: low_pass(x, 1), lambda x: plain.low_pass(x, 1)),
-        case("low-pass three times, sizes 1..65", lambda x: low_pass(x, 3), lambda x: plain.low_pass(x, 3)),
+        case("collapse of a Laplacian pyramid, sizes 1..65", lambda x: 1 * x, None, there_and_back),
+        case("REDUCE, sizes 1..65", plain.reduce, by_convolution, reduce),
+        case("REDUCE three times, sizes 1..65", thrice, lambda x: by_convolution(x, 3), lambda x: reduce(x, 3)),
+        case("low-pass, sizes 1..65", lambda x: plain.low_pass(x, 1), lambda x: low_pass(x, 1)),
+        case("low-pass three times, sizes 1..65", lambda x: plain.low_pass(x, 3), lambda x: low_pass(x, 3)),
     ]

@@ -26,8 +26,8 @@ class Evaluated:
 def evaluate(case: Case, compute: Compute, dtype: torch.dtype, device: str = "cpu") -> Evaluated:
     """Forward and backward on the case's inputs, rounded to float32 and then cast to `dtype`."""
     leaves = _leaves(case, dtype, device)
-    outputs = compute(leaves)
-    return _differentiate(leaves, [outputs])[0]
+    with torch.autocast(device, dtype=case.autocast, enabled=case.autocast is not None):
+        return _differentiate(leaves, [compute(leaves)])[0]
 
 
 def truths(case: Case) -> list[Evaluated]:
