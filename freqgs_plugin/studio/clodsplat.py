@@ -2,6 +2,7 @@
 
 import statistics
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -10,17 +11,20 @@ from nerfstudio.utils.colormaps import apply_float_colormap
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from freqgs_plugin.functional.attenuation import DistanceDecay, Reference, frustum_distance, log_decay
+from freqgs_plugin.functional.attenuation import Attenuation, DistanceDecay, Reference, frustum_distance, log_decay
+from freqgs_plugin.functional.budget import DecayBudget
+from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.rendering.render import render_prefixes
 from freqgs_plugin.studio.config import FreqSplatModelConfig
-from freqgs_plugin.studio.controls import Stopwatch, detail_slider, in_viewer
+from freqgs_plugin.studio.controls import Stopwatch, budget_of, detail_slider, in_viewer
 from freqgs_plugin.studio.model import FreqSplatModel
 from freqgs_plugin.studio.outputs import LazyOutputs
+from freqgs_plugin.studio.starting import start_from
 from freqgs_plugin.studio.targets import ViewTarget
 from freqgs_plugin.studio.viewing import psnr, show, uncached_property
 from freqgs_plugin.training.detail import CountGradient, DetailSampling, count_loss
 from freqgs_plugin.training.objective import pyramid_objective
-from freqgs_plugin.training.schedule import scaled
+from freqgs_plugin.training.schedule import Schedule, scaled
 from freqgs_plugin.types import Camera, Gaussians, Rendering
 
 _FAINTEST = -60.0
@@ -49,6 +53,13 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     reg_gradient: CountGradient = "ste"
     """gradient of that loss: none (the paper's formula has none), ste (counts exactly, gradient of a sigmoid; ours),
     soft (sum of the sigmoids). ste and soft are divided by (s_max - 1)^2"""
+    reg_temperature: float = 0.5
+    """width of these sigmoids, in units of ln(opacity / threshold): the larger, the more opaque a Gaussian may be to be
+    still pushed to fade"""
+    reg_opacities: bool = False
+    """opacities learn from that loss, too"""
+    learn_in_recovery: bool = True
+    """decays are learned while opacities recover from a reset, too"""
     densify_compensate: bool = True
     """2D gradients are divided by w_s before densification looks at them (ours)"""
     train_reference: Reference = "frustum_max"
@@ -66,6 +77,14 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     """sigma is held at or above this where dead_decay is keep (ours)"""
     detail_scales: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 5.0)
     """scales that are evaluated, and offered as outputs detail_1, detail_1.5 ..."""
+    init_from: Path | None = None
+    """Gaussians to start from: a 3DGS PLY, or a splatfacto, lapsplat or clodsplat run (its folder or config.yml);
+    opacities then decay from the first step on"""
+    init_from_frame: Literal["scene", "dataset"] = "scene"
+    """frame of a PLY's coordinates: the scene as nerfstudio trains and exports it, or the data set (COLMAP), as INRIA's
+    code writes it. Runs say it themselves"""
+    init_refine: bool = False
+    """densify, prune and reset opacities in a run that starts from Gaussians"""
     export_distance: float = 0.5
     """ns-export writes opacities as seen from this normalised distance: a plain 3DGS scene cannot fade"""
 
@@ -91,6 +110,7 @@ class ClodSplatModel(FreqSplatModel):
     def populate_modules(self) -> None:
         super().populate_modules()
         self._decays = False
+        self._started = False
         self._scene_distance = 1.0
         self.detail = detail_slider(2 * max(self.config.largest_scale, 1.5))
 
@@ -100,6 +120,26 @@ class ClodSplatModel(FreqSplatModel):
             decay = torch.full((len(parameters["means"]), 1), self.config.initial_decay)
             parameters["decay"] = torch.nn.Parameter(decay)
         return parameters
+
+    def _begin_run(self, datamanager: Any) -> None:
+        if self.config.init_from is not None:
+            start_from(self, self.config.init_from, self.config.init_from_frame, datamanager)
+
+    def take_over(self, raw: RawGaussians) -> None:
+        """Make these the Gaussians to train, all of one level; those without a decay get the initial one."""
+        raw, config = raw.with_degree(self.config.sh_degree), self.config
+        values = {name: getattr(raw, name) for name in (*GROUPS, "decay")}
+        if not config.use_decay:
+            del values["decay"]
+        elif raw.decay is None:
+            values["decay"] = torch.full((len(raw), 1), config.initial_decay)
+        else:
+            values["decay"] = raw.decay[:, None]
+        self.gauss_params = torch.nn.ParameterDict(
+            {name: torch.nn.Parameter(value.to(self.device)) for name, value in values.items()}
+        )
+        self.level = torch.ones(len(raw), dtype=torch.int32, device=self.device)
+        self._started, self._sh_degree = True, config.sh_degree
 
     # -- the scene ------------------------------------------------------------------------------------------------
 
@@ -123,16 +163,35 @@ class ClodSplatModel(FreqSplatModel):
     def _attenuation(self) -> DistanceDecay | None:
         return self.attenuation(1.0)
 
-    def _viewer_attenuation(self) -> DistanceDecay | None:
-        return self.attenuation(float(self.detail.value))
+    def _viewer_attenuation(self) -> Attenuation | None:
+        decay, count = self.attenuation(float(self.detail.value)), budget_of(self.budget)
+        if decay is None:
+            return super()._viewer_attenuation()
+        if count is None:
+            return decay
+        return DecayBudget(
+            count,
+            decay.reference,
+            decay.scene_distance,
+            decay.soft,
+            least=decay.scale,
+            largest=self.config.largest_scale,
+        )
 
     # -- schedule and densification -------------------------------------------------------------------------------
+
+    def _make_schedule(self) -> Schedule:
+        schedule = super()._make_schedule()
+        # no step is before -1
+        return replace(schedule, refine_stop=-1) if self._started and not self.config.init_refine else schedule
 
     def _begin_step(self, step: int) -> None:
         super()._begin_step(step)
         config = self.config
+        if self._started:
+            self._sh_degree = config.sh_degree
         self._sampling = DetailSampling(
-            start=scaled(config.decay_start_step, self._scale, least=0),
+            start=0 if self._started else scaled(config.decay_start_step, self._scale, least=0),
             largest=config.largest_scale,
             seed=config.seed,
             full_detail_every=config.full_detail_every,
@@ -209,12 +268,19 @@ class ClodSplatModel(FreqSplatModel):
     def _training_renderings(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> list[Rendering]:
         decay, more = None, {"loss_weight": 1.0}
         if self._decays:
-            decay = self._training_decay(self._sampling.scale(self.step, self.schedule.recovers(self.step)))
-            margin = decay.margin(gaussians, camera)
+            recovers = self.schedule.recovers(self.step)
+            if recovers and not self.config.learn_in_recovery:
+                assert gaussians.decay is not None
+                gaussians = replace(gaussians, decay=gaussians.decay.detach())
+            decay = self._training_decay(self._sampling.scale(self.step, recovers))
+            unlearned = gaussians
+            if not self.config.reg_opacities:
+                unlearned = replace(gaussians, opacities=gaussians.opacities.detach())
+            margin = decay.margin(unlearned, camera)
             if not bool((margin > 0).any()):
                 # an empty picture teaches nothing
                 decay = self._training_decay(1.0)
-                margin = decay.margin(gaussians, camera)
+                margin = decay.margin(unlearned, camera)
             weight = self._sampling.loss_weight(decay.scale) if self.config.weigh_scales else 1.0
             more = {"loss_weight": weight, "scale": decay.scale, "margin": margin}
         options = {"rasterizer": self.rasterizer(), "background": background, "antialiased": self.antialiased}
@@ -233,8 +299,10 @@ class ClodSplatModel(FreqSplatModel):
             targets=target.pyramid,
         )
         if self._decays and config.reg_weight != 0:
-            regularizer = count_loss(info["margin"], info["scale"], config.largest_scale, config.reg_gradient)
-            losses["count"] = info["loss_weight"] * config.reg_weight * regularizer
+            excess = count_loss(
+                info["margin"], info["scale"], config.largest_scale, config.reg_gradient, config.reg_temperature
+            )
+            losses["count"] = info["loss_weight"] * config.reg_weight * excess
         return losses
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
@@ -251,11 +319,13 @@ class ClodSplatModel(FreqSplatModel):
     # -- checkpoints ----------------------------------------------------------------------------------------------
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {**super().get_extra_state(), "decays": self._decays, "scene_distance": self._scene_distance}
+        ours = {"decays": self._decays, "started": self._started, "scene_distance": self._scene_distance}
+        return {**super().get_extra_state(), **ours}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         super().set_extra_state(state)
         self._decays = bool(state["decays"])
+        self._started = bool(state.get("started", False))
         self._scene_distance = float(state["scene_distance"])
 
     # -- pictures, evaluation, export -----------------------------------------------------------------------------

@@ -42,7 +42,8 @@ class DetailSampling:
         full = self.full_detail_every > 0 and step % self.full_detail_every == 0
         if held or full or not self.active(step):
             return 1.0
-        return float(np.random.default_rng((self.seed, step)).uniform(1.0, self.largest))
+        # the last number keeps this apart from other draws of the step
+        return float(np.random.default_rng((self.seed, step, 1)).uniform(1.0, self.largest))
 
     def loss_weight(self, scale: float) -> float:
         """w_s = (1 - s_v / (2 s_max))^2: the farther, the less a step counts (Eq. 5)."""
