@@ -1,8 +1,11 @@
 """The `freqgs` command. Heavy imports happen inside of the commands, so that `--help` is quick."""
 
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal, Union
+
+from freqgs_plugin.reports.bench.commands import BENCHES
 
 
 def demo(
@@ -45,7 +48,7 @@ def demo(
 
 def stability(
     output_dir: Path = Path("stability-out"),
-    only: Literal["geometry", "compositing", "losses"] | None = None,
+    only: Literal["geometry", "compositing", "losses", "autocast"] | None = None,
     quick: bool = False,
 ) -> None:
     """Run a grid of extremes through every backend and dtype: value and gradient errors, finite or not, time.
@@ -68,17 +71,22 @@ def stability(
 COMMANDS = {
     "demo": demo,
     "stability": stability,
+    "bench": BENCHES,
 }
-"""name on the command line -> function; its signature and docstring become the options and the help"""
+"""name on the command line -> function, whose signature and docstring become the options and the help, or -> a table of
+such commands"""
+
+GROUPS = {"bench": "Measure times, memory and errors, and write them as JSON, Markdown and pictures."}
+"""help of each table in COMMANDS"""
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point. Errors that name their remedy are printed without a traceback; the exit status is then 1."""
-    import tyro.extras
+    import tyro
 
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS, prog="freqgs", description="Level of detail for Gaussian splatting.", args=arguments
+        tyro.cli(
+            _one_of(COMMANDS), prog="freqgs", description="Level of detail for Gaussian splatting.", args=arguments
         )
     except KeyboardInterrupt:
         sys.exit(130)
@@ -89,13 +97,37 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(1)
 
 
+def _one_of(commands: Mapping[str, Any]) -> Any:
+    """The type of which tyro makes subcommands: a union with one member per command."""
+    from tyro.conf import subcommand
+
+    members = []
+    for name, command in commands.items():
+        constructor = command if callable(command) else _group(GROUPS[name], command)
+        members.append(Annotated[Any, subcommand(name=name, constructor=constructor)])
+    return Union[tuple(members)]  # noqa: UP007
+
+
+def _group(description: str, commands: Mapping[str, Any]) -> Callable[..., None]:
+    """A command that has commands: by the time it is called, tyro has called the one that was chosen."""
+    from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes
+
+    def group(command: Any) -> None:
+        del command
+
+    group.__doc__ = description
+    group.__annotations__["command"] = OmitSubcommandPrefixes[OmitArgPrefixes[_one_of(commands)]]
+    return group
+
+
 def _expected(error: Exception) -> bool:
     """Errors raised for the user to read."""
     from freqgs_plugin.demo.training import TrainingError
     from freqgs_plugin.io.check_images import SceneError
+    from freqgs_plugin.reports.bench.options import BenchError
     from freqgs_plugin.reports.stability.runner import StabilityError
 
-    return isinstance(error, FileExistsError | TrainingError | SceneError | StabilityError)
+    return isinstance(error, FileExistsError | TrainingError | SceneError | StabilityError | BenchError)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
@@ -35,19 +35,48 @@ def measure(function: Callable[[], object], repeats: int = 9, warmup: int = 2) -
     Raises:
         ValueError: fewer than one repeat.
     """
-    if repeats < 1:
-        raise ValueError(f"repeats is {repeats}; at least one run is needed")
-    for _ in range(warmup):
-        function()
-    durations = []
-    for _ in range(repeats):
-        _wait()
-        start = time.perf_counter()
-        function()
-        _wait()
-        durations.append(1000 * (time.perf_counter() - start))
-    low, median, high = np.quantile(durations, (0.25, 0.5, 0.75))
-    return Timing(float(median), float(low), float(high), repeats)
+    return interleaved({"": function}, repeats, warmup)[""]
+
+
+def interleaved(
+    candidates: Mapping[str, Callable[[], object]],
+    rounds: int,
+    warmup: int = 1,
+    on_round: Callable[[], object] = lambda: None,
+) -> dict[str, Timing]:
+    """Time several functions against each other: every round runs each of them once, every second round backwards.
+
+    What slows the machine down for a while then slows all of them. `on_round` is called after each round.
+
+    Raises:
+        ValueError: fewer than one round.
+    """
+    if rounds < 1:
+        raise ValueError(f"repeats is {rounds}; at least one run is needed")
+    for function in candidates.values():
+        for _ in range(warmup):
+            function()
+    durations: dict[str, list[float]] = {name: [] for name in candidates}
+    for number in range(rounds):
+        names = list(candidates)
+        for name in names if number % 2 == 0 else reversed(names):
+            durations[name].append(_milliseconds(candidates[name]))
+        on_round()
+    return {name: timing_of(times) for name, times in durations.items()}
+
+
+def timing_of(milliseconds: Sequence[float]) -> Timing:
+    """Median and quartiles of at least one duration, ms."""
+    low, median, high = np.quantile(milliseconds, (0.25, 0.5, 0.75))
+    return Timing(float(median), float(low), float(high), len(milliseconds))
+
+
+def _milliseconds(function: Callable[[], object]) -> float:
+    _wait()
+    start = time.perf_counter()
+    function()
+    _wait()
+    return 1000 * (time.perf_counter() - start)
 
 
 def _wait() -> None:
