@@ -179,7 +179,11 @@ def _distances(gaussians: Gaussians, camera: Camera) -> tuple[Float[Tensor, " n"
     # autocast would take these products at half precision
     with torch.autocast(means.device.type, enabled=False):
         viewmat, intrinsics = camera.viewmat.to(means), camera.K.to(means)
-        x, y, z = torch.addmm(viewmat[:3, 3:], viewmat[:3, :3], means.T)
+        # about a rounded camera centre, so that scenes far from the origin keep their digits
+        exact = camera.viewmat[:3].to("cpu", torch.float64)
+        centre = (-exact[:, :3].T @ exact[:, 3]).to(means)
+        rest = exact[:, 3] + exact[:, :3] @ centre.to("cpu", torch.float64)
+        x, y, z = torch.addmm(rest[:, None].to(means), viewmat[:3, :3], (means - centre).T)
     front = z > NEAR_PLANE
     depth = torch.where(front, z, 1.0)
     u = x / depth * intrinsics[0, 0] + intrinsics[0, 2]

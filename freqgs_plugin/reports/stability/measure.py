@@ -14,6 +14,9 @@ TRUTH = Setting("torch", torch.float64)
 LEAST_SHARE = 1e-3
 """a gradient whose norm is under this share of the largest one's is compared with that share instead"""
 
+NEGLIGIBLE = 1e-30
+"""norm of a difference of gradients that counts as none"""
+
 
 @dataclass(frozen=True)
 class Evaluated:
@@ -163,7 +166,7 @@ def _gradient_error(actual: Tensors, expected: Tensors, units: Tensors) -> float
     for name, gradient in expected.items():
         difference = norm(name, actual[name].double() - gradient)
         size = max(sizes[name], floor)
-        errors.append(0.0 if difference == 0 else difference / size if size > 0 else float("inf"))
+        errors.append(0.0 if difference <= NEGLIGIBLE else difference / size if size > 0 else float("inf"))
     return max(errors)
 
 

@@ -4,7 +4,7 @@ import importlib
 
 from freqgs_plugin.reports.stability.case import Case, Group
 
-GROUPS: tuple[Group, ...] = ("geometry", "compositing", "losses", "autocast")
+GROUPS: tuple[Group, ...] = ("geometry", "compositing", "decay", "losses", "autocast")
 
 
 def cases_of(group: Group, quick: bool) -> list[Case]:
