@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.utils.colormaps import apply_float_colormap
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
@@ -18,6 +19,7 @@ from freqgs_plugin.rendering.render import render_prefixes
 from freqgs_plugin.studio.config import FreqSplatModelConfig
 from freqgs_plugin.studio.controls import Stopwatch, budget_of, detail_slider, in_viewer
 from freqgs_plugin.studio.model import FreqSplatModel
+from freqgs_plugin.studio.optimizers import set_rate
 from freqgs_plugin.studio.outputs import LazyOutputs
 from freqgs_plugin.studio.starting import start_from
 from freqgs_plugin.studio.targets import ViewTarget
@@ -27,6 +29,8 @@ from freqgs_plugin.training.objective import pyramid_objective
 from freqgs_plugin.training.schedule import Schedule, scaled
 from freqgs_plugin.types import Camera, Gaussians, Rendering
 
+_LARGEST_SPEEDUP = 10.0
+"""the decays' learning rate is never more than so many times its setting"""
 _FAINTEST = -60.0
 """least ln(opacity) that is exported; viewers draw nothing under ln(1/255) = -5.5"""
 
@@ -44,8 +48,8 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     """sigma of every Gaussian at first, in normalised distances (ours; the paper does not say)"""
     largest_scale: float = 5.0
     """s_max: training draws its virtual distance scale from U(1, s_max) (the paper: 1, 3, 5 or 7)"""
-    full_detail_every: int = 0
-    """every so many steps the scale is 1; 0: only by chance (the paper)"""
+    full_detail_every: int = 4
+    """every so many steps the scale is 1 (ours); 0: only by chance (the paper)"""
     weigh_scales: bool = True
     """steps at larger scales count less, by w_s of Eq. 5 (the paper)"""
     reg_weight: float = 1.0
@@ -53,13 +57,11 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     reg_gradient: CountGradient = "ste"
     """gradient of that loss: none (the paper's formula has none), ste (counts exactly, gradient of a sigmoid; ours),
     soft (sum of the sigmoids). ste and soft are divided by (s_max - 1)^2"""
-    reg_temperature: float = 0.5
-    """width of these sigmoids, in units of ln(opacity / threshold): the larger, the more opaque a Gaussian may be to be
-    still pushed to fade"""
+    reg_temperature: float = 2.0
+    """width of these sigmoids, in units of ln(opacity / threshold): the wider, the more opaque are Gaussians that are
+    still pushed to fade (ours)"""
     reg_opacities: bool = False
-    """opacities learn from that loss, too"""
-    learn_in_recovery: bool = True
-    """decays are learned while opacities recover from a reset, too"""
+    """opacities learn from that loss, too: fewer Gaussians, but hardly fewer of them at larger scales"""
     densify_compensate: bool = True
     """2D gradients are divided by w_s before densification looks at them (ours)"""
     train_reference: Reference = "frustum_max"
@@ -71,8 +73,8 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     """viewing fades Gaussians between 1 and 2 times the threshold, so that nothing pops (ours)"""
     train_soft_cut: bool = False
     """the same in training (the paper: no)"""
-    dead_decay: Literal["prune", "keep"] = "prune"
-    """Gaussians with sigma <= 0, which nothing brings back: removed, or kept alive by holding sigma at least_decay"""
+    dead_decay: Literal["prune", "keep"] = "keep"
+    """Gaussians with sigma <= 0, which nothing brings back: removed, or kept from it by a least_decay (ours)"""
     least_decay: float = 0.25
     """sigma is held at or above this where dead_decay is keep (ours)"""
     detail_scales: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 5.0)
@@ -180,6 +182,15 @@ class ClodSplatModel(FreqSplatModel):
 
     # -- schedule and densification -------------------------------------------------------------------------------
 
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:  # pyright: ignore
+        """As of the base. Decays have as far to go in a short run as in a long one: their rate is raised."""
+        callbacks = super().get_training_callbacks(attributes)
+        if self.config.use_decay:
+            assert attributes.trainer is not None and attributes.optimizers is not None
+            rate = attributes.trainer.config.optimizers["decay"]["optimizer"].lr
+            set_rate(attributes.optimizers, "decay", rate * min(max(1 / self._scale, 1.0), _LARGEST_SPEEDUP))
+        return callbacks
+
     def _make_schedule(self) -> Schedule:
         schedule = super()._make_schedule()
         # no step is before -1
@@ -268,11 +279,7 @@ class ClodSplatModel(FreqSplatModel):
     def _training_renderings(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> list[Rendering]:
         decay, more = None, {"loss_weight": 1.0}
         if self._decays:
-            recovers = self.schedule.recovers(self.step)
-            if recovers and not self.config.learn_in_recovery:
-                assert gaussians.decay is not None
-                gaussians = replace(gaussians, decay=gaussians.decay.detach())
-            decay = self._training_decay(self._sampling.scale(self.step, recovers))
+            decay = self._training_decay(self._sampling.scale(self.step, self.schedule.recovers(self.step)))
             unlearned = gaussians
             if not self.config.reg_opacities:
                 unlearned = replace(gaussians, opacities=gaussians.opacities.detach())

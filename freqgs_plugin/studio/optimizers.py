@@ -36,6 +36,16 @@ def scale_schedulers(optimizers: Optimizers, scale: float) -> None:
             _apply(optimizers, name, scheduler)
 
 
+def set_rate(optimizers: Optimizers, name: str, rate: float) -> None:
+    """Make `rate` the learning rate of group `name`, or the one that its schedule begins with."""
+    scheduler = optimizers.schedulers.get(name)
+    if isinstance(scheduler, LambdaLR):
+        scheduler.base_lrs = [rate]
+        _apply(optimizers, name, scheduler)
+    else:
+        optimizers.optimizers[name].param_groups[0]["lr"] = rate
+
+
 def restart(optimizers: Optimizers, names: tuple[str, ...], schedulers: bool) -> None:
     """Forget the state of the optimizers in `names` and, if asked, begin their schedules anew."""
     for name in names:

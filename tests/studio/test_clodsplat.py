@@ -13,6 +13,7 @@ from running import SIZE, advance, save
 from state import all_finite, consistent, optimizer_state, parameters, same, statistics
 
 from freqgs_plugin.functional.attenuation import TAU, DistanceDecay, normalised_distance
+from freqgs_plugin.studio.optimizers import set_rate
 
 pytestmark = pytest.mark.slow
 
@@ -72,12 +73,23 @@ class TestStart:
         assert "decay" not in model.gauss_params and model.gaussians().decay is None and model.attenuation(9.0) is None
         assert set(runs[1].optimizers.optimizers) == set(without)
 
+    @pytest.mark.parametrize(("scale", "speedup"), [(0.004, 10.0), (0.2, 5.0), (1.0, 1.0), (3.0, 1.0)])
+    def test_short_runs_learn_decays_faster(self, make, scale, speedup):
+        trainer = make(steps_scale=scale)
+        (group,) = trainer.optimizers.optimizers["decay"].param_groups
+        assert group["lr"] == pytest.approx(1e-2 * speedup)
+        advance(trainer, 3)
+        resumed = make(steps_scale=scale, load_dir=save(trainer))
+        (again,) = resumed.optimizers.optimizers["decay"].param_groups
+        assert again["lr"] == trainer.optimizers.optimizers["decay"].param_groups[0]["lr"] < group["lr"] + 1e-9
+        assert resumed.optimizers.optimizers["means"].param_groups[0]["lr"] <= 1.6e-4
+
     def test_the_scene_distance_is_measured(self, make):
         trainer = make()
         model = trainer.pipeline.model
         advance(trainer, START + 1)
         gaussians = model.gaussians()
-        assert isinstance(model.attenuation(2.0), DistanceDecay)
+        assert model.attenuation(2.0) == DistanceDecay(2.0, "scene", model.scene_distance, soft=True)
         largest = []
         for camera in model._train_cameras():
             distance = (gaussians.means - camera.centre).norm(dim=1)
@@ -88,7 +100,7 @@ class TestStart:
 
 class TestSteps:
     def test_scales_are_drawn_and_held_after_resets(self, make):
-        trainer = make()
+        trainer = make(full_detail_every=0)
         model = trainer.pipeline.model
         scales = {}
         for step in range(START + 60):
@@ -131,7 +143,7 @@ class TestSteps:
         """Twice the same step, with and without w_s: the statistics agree, the loss does not."""
         found = {}
         for weigh in (True, False):
-            trainer = make(weigh_scales=weigh, reg_weight=0.0)
+            trainer = make(weigh_scales=weigh, reg_weight=0.0, full_detail_every=0)
             trainer.pipeline.datamanager.train_unseen_cameras = [0, 1, 2, 3, 4, 5] * 6
             torch.manual_seed(1)
             advance(trainer, START)
@@ -145,7 +157,7 @@ class TestSteps:
         torch.testing.assert_close(found[True][1], found[False][1], rtol=1e-3, atol=1e-9)
 
     def test_nothing_to_draw_at_this_scale_draws_at_1(self, make):
-        trainer = make()
+        trainer = make(full_detail_every=0)
         model = trainer.pipeline.model
         advance(trainer, START + 1)
         while model.schedule.recovers(model.step + 1):
@@ -188,7 +200,7 @@ class TestDensification:
             model.gauss_params["features_dc"][:] = model.gauss_params["decay"] * 10
             model.gauss_params["opacities"][::7] = -10.0
         for name in ("features_dc", "decay"):
-            trainer.optimizers.optimizers[name].param_groups[0]["lr"] = 0.0
+            set_rate(trainer.optimizers, name, 0.0)
         counts = {model.num_points}
         for _ in range(12):
             advance(trainer, 1)
@@ -199,14 +211,14 @@ class TestDensification:
         assert len(counts) > 2
 
     def test_the_dead_are_removed_and_counted(self, make, said):
-        trainer = make(densify_grad_thresh=1e6, reset_alpha_every=1000)
+        trainer = make(densify_grad_thresh=1e6, reset_alpha_every=1000, dead_decay="prune")
         model = trainer.pipeline.model
         advance(trainer, START + 1)
         with torch.no_grad():
             model.gauss_params["decay"][:30] = -1.0
             model.gauss_params["opacities"][:] = 3.0
         rest = parameters(model)["features_dc"][30:]
-        trainer.optimizers.optimizers["features_dc"].param_groups[0]["lr"] = 0.0
+        set_rate(trainer.optimizers, "features_dc", 0.0)
         camera, batch = view(trainer)
         metrics, _ = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
         assert metrics["dead_decay"] == 30
@@ -218,13 +230,13 @@ class TestDensification:
         consistent(trainer)
 
     def test_those_dark_in_every_view_go_before_a_reset(self, make, said):
-        trainer = make(densify_grad_thresh=1e6, least_weight=0.0, least_views=0)
+        trainer = make(densify_grad_thresh=1e6, least_weight=0.0, least_views=0, dead_decay="prune")
         model = trainer.pipeline.model
         advance(trainer, START + 1)
         with torch.no_grad():
             model.gauss_params["decay"][:30] = 1e-3
             model.gauss_params["opacities"][:] = 3.0
-        trainer.optimizers.optimizers["decay"].param_groups[0]["lr"] = 0.0
+        set_rate(trainer.optimizers, "decay", 0.0)
         while not model.schedule.looks_at_views(model.step):
             assert not any("dead decay" in line for line in said)
             advance(trainer, 1)
@@ -301,14 +313,16 @@ ABLATIONS = {
     "soft": {"reg_gradient": "soft"},
     "only full detail": {"largest_scale": 1.0},
     "far": {"largest_scale": 1e4},
-    "often full detail": {"full_detail_every": 2},
+    "full detail by chance": {"full_detail_every": 0},
     "uncompensated": {"densify_compensate": False},
     "quantile": {"train_reference": "frustum_quantile", "view_reference": "frustum_quantile"},
     "scene": {"train_reference": "scene"},
     "frustum": {"view_reference": "frustum_max"},
     "hard cut": {"soft_cut": False},
     "soft cut in training": {"train_soft_cut": True},
-    "kept alive": {"dead_decay": "keep"},
+    "pruned": {"dead_decay": "prune"},
+    "opacities learn too": {"reg_opacities": True},
+    "narrow sigmoids": {"reg_temperature": 0.1},
     "from the start": {"decay_start_step": 0},
     "tiny decay": {"initial_decay": 1e-3},
     "huge decay": {"initial_decay": 1e8},

@@ -5,7 +5,7 @@ import pytest
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 
-from freqgs_plugin.studio.optimizers import adopt_parameters, restart, scale_schedulers
+from freqgs_plugin.studio.optimizers import adopt_parameters, restart, scale_schedulers, set_rate
 from method_configs.optimizers import splat_optimizers
 
 
@@ -121,3 +121,13 @@ def test_restart(optimizers, schedulers):
     assert rate(optimizers) == (pytest.approx(first) if schedulers else decayed)
     step(optimizers)
     assert rate(optimizers) < (first if schedulers else decayed)
+
+
+@pytest.mark.parametrize("name", ["means", "scales"])
+def test_a_rate_is_set_with_and_without_a_schedule(optimizers, name):
+    step(optimizers, 5)
+    before = rate(optimizers, name) / (1.6e-4 if name == "means" else 0.005)
+    set_rate(optimizers, name, 3.0)
+    assert rate(optimizers, name) == pytest.approx(3.0 * before)
+    step(optimizers)
+    assert 2.9 < rate(optimizers, name) <= 3.0
