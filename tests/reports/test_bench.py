@@ -66,7 +66,17 @@ def test_timing_has_median_and_quartiles():
 
 @pytest.mark.parametrize(
     "value, text",
-    [(0, "0"), (None, "-"), (0.004, "4.0e-03"), (1.234, "1.23"), (12.34, "12.3"), (1234.5, "1,234"), (3e7, "3.0e+07")],
+    [
+        (0, "0"),
+        (None, "-"),
+        (0.0004, "4.0e-04"),
+        (0.06, "0.06"),
+        (0.01234, "0.0123"),
+        (1.234, "1.23"),
+        (12.34, "12.3"),
+        (1234.5, "1,234"),
+        (3e7, "3.0e+07"),
+    ],
 )
 def test_numbers_have_three_digits(value, text):
     assert number(value) == text

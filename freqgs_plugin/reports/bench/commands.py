@@ -1,6 +1,8 @@
 """The commands of `freqgs bench`. Heavy imports happen inside of them."""
 
-from typing import Annotated
+import sys
+from pathlib import Path
+from typing import Annotated, Any
 
 import tyro
 
@@ -11,23 +13,42 @@ Options = Annotated[BenchOptions, tyro.conf.arg(name="")]
 
 def raster(options: Options = BenchOptions()) -> None:  # noqa: B008
     """Time every backend, and measure its memory; all prefixes in one pass; less detail against everything."""
-    from rich.console import Console
-
     from freqgs_plugin.reports.bench.raster import raster_bench
     from freqgs_plugin.reports.bench.runner import run_bench
 
-    run_bench(raster_bench(options), options, Console())
+    run_bench(raster_bench(options), options, _console())
 
 
 def scaling(options: Options = BenchOptions()) -> None:  # noqa: B008
     """Time numba and torch as Gaussians and pixels become more, and fit the exponents."""
-    from rich.console import Console
-
     from freqgs_plugin.reports.bench.runner import run_bench
     from freqgs_plugin.reports.bench.scaling import scaling_bench
 
-    run_bench(scaling_bench(options), options, Console())
+    run_bench(scaling_bench(options), options, _console())
 
 
-BENCHES = {"raster": raster, "scaling": scaling}
+def accuracy(load_config: Path | None = None, options: Options = BenchOptions()) -> None:  # noqa: B008
+    """Measure errors beside times: of the backends against float64, and of each approximation against the exact sum.
+
+    Args:
+        load_config: config.yml of a trained run, of which a held-out view is measured as well.
+        options: where to write, and how to measure.
+    """
+    from freqgs_plugin.reports.bench.accuracy import accuracy_bench
+    from freqgs_plugin.reports.bench.runner import run_bench
+    from freqgs_plugin.reports.bench.trained import load, trained_workload
+
+    trained = None if load_config is None else trained_workload(load(load_config))
+    arguments = [] if load_config is None else ["--load-config", "RUN/config.yml"]
+    run_bench(accuracy_bench(options, trained), options, _console(), *arguments)
+
+
+def _console() -> Any:
+    """Tables are not folded to the 80 columns that a file or a pipe would have."""
+    from rich.console import Console
+
+    return Console() if sys.stdout.isatty() else Console(width=200)
+
+
+BENCHES = {"raster": raster, "scaling": scaling, "accuracy": accuracy}
 """name on the command line -> function"""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from freqgs_plugin.rendering.base import get_rasterizer
 from freqgs_plugin.reports.bench.fit import GROWN, PowerLaw, asymptotic
 from freqgs_plugin.reports.bench.options import BenchOptions
+from freqgs_plugin.reports.bench.rounds import fitting
 from freqgs_plugin.reports.bench.runner import Bench, Measured, Tick
 from freqgs_plugin.reports.bench.tables import BenchTable, Row, milliseconds
 from freqgs_plugin.reports.bench.workloads import (
@@ -99,9 +100,8 @@ def _times(rasterizers: dict, of: Workload, rounds: int, expected: float) -> dic
     for name, rasterizer in rasterizers.items():
         ways[f"{name} forward"] = lambda r=rasterizer: draw(r, of)
         ways[f"{name} both"] = lambda r=rasterizer: draw_and_differentiate(r, of)
-    fitting = rounds if expected == 0 else min(rounds, max(2, int(PATIENCE / (1.4 * expected))))
     # large ones come after small ones: what is loaded on first use is loaded
-    times = interleaved(ways, fitting, warmup=int(1.4 * expected < PATIENCE / 2))
+    times = interleaved(ways, fitting(rounds, PATIENCE, 1.4 * expected), warmup=int(1.4 * expected < PATIENCE / 2))
     return {name: (times[f"{name} forward"], times[f"{name} both"]) for name in rasterizers}
 
 
@@ -155,8 +155,9 @@ def point_table(rows: list[Row]) -> BenchTable:
             ("rounds", lambda row: "-" if row["forward"] is None else str(row["forward"].repeats)),
         ],
         f"*Both*: forward and backward. Medians (quartiles); rounds are fewer where they take long. A dash: a call "
-        f"would have taken over {LIMIT:g} s. Gaussians are random, of 0.005 to 0.04 world units at depths 2 to 6, and keep their size as they become more: "
-        "pixels are then finished sooner. The focal length is the image's width, so larger images show the same scene.",
+        f"would have taken over {LIMIT:g} s. Gaussians are random, of {SIZE[0]:g} to {SIZE[1]:g} world units at depths "
+        "2 to 6, and keep their size as they become more: pixels are then finished sooner. The focal length is the "
+        "image's width, so larger images show the same scene.",
     )
 
 

@@ -69,13 +69,15 @@ def milliseconds(timing: Timing | None) -> str:
 
 
 def number(value: float | int | None) -> str:
-    """Three digits, without an exponent between 0.01 and a million."""
+    """Three digits, without an exponent between 0.001 and a million."""
     if value is None:
         return "-"
     if value == 0:
         return "0"
-    if not 0.01 <= abs(value) < 1e6:
+    if not 0.001 <= abs(value) < 1e6:
         return f"{value:.1e}"
+    if abs(value) < 1:
+        return f"{value:.3g}"
     digits = 2 if abs(value) < 10 else 1 if abs(value) < 100 else 0
     return f"{value:,.{digits}f}"
 

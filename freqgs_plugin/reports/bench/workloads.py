@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -25,6 +26,7 @@ class Workload:
     camera: Camera
     background: Float[Tensor, " 3"]
     gradient: Float[Tensor, "h w 3"]
+    antialiased: bool = False
 
     @property
     def size(self) -> str:
@@ -34,7 +36,8 @@ class Workload:
         """The same workload elsewhere; numbers are not rounded anew when the dtype widens."""
         splats = Splats(*(getattr(self.splats, name).to(device, dtype) for name in LEAVES))
         camera = replace(self.camera, viewmat=self.camera.viewmat.to(device, dtype), K=self.camera.K.to(device, dtype))
-        return Workload(self.name, splats, camera, self.background.to(device, dtype), self.gradient.to(device, dtype))
+        background, gradient = self.background.to(device, dtype), self.gradient.to(device, dtype)
+        return replace(self, splats=splats, camera=camera, background=background, gradient=gradient)
 
 
 NAMES = ("medium", "large", "small splats")
@@ -101,8 +104,13 @@ def _across(share: Tensor, side: int, focal: float) -> Tensor:
 
 def _viewed(name: str, splats: Splats, focal: float, width: int, height: int) -> Workload:
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    gradient = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(IMAGE_SEED))
-    return Workload(name, splats, Camera(torch.eye(4), K, width, height), torch.tensor([0.1, 0.2, 0.3]), gradient)
+    camera = Camera(torch.eye(4), K, width, height)
+    return Workload(name, splats, camera, torch.tensor([0.1, 0.2, 0.3]), image_gradient(camera))
+
+
+def image_gradient(camera: Camera) -> Float[Tensor, "h w 3"]:
+    """Normally distributed."""
+    return torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(IMAGE_SEED))
 
 
 def random_levels(n: int, levels: int) -> Tensor:
@@ -129,12 +137,31 @@ def with_detail(of: Workload, levels: int) -> Gaussians:
 def draw(rasterizer: Rasterizer, of: Workload) -> Tensor:
     """The picture, without gradients."""
     with torch.no_grad():
-        return rasterizer(of.splats, of.camera, background=of.background, depth=False).features
+        return _picture(rasterizer, of.splats, of)
 
 
 def draw_and_differentiate(rasterizer: Rasterizer, of: Workload) -> tuple[Tensor, dict[str, Tensor]]:
     """The picture, and the gradients of its product with `of.gradient` by all of the splats' tensors."""
     leaves = {name: getattr(of.splats, name).detach().clone().requires_grad_() for name in LEAVES}
-    picture = rasterizer(Splats(**leaves), of.camera, background=of.background, depth=False).features
+    picture = _picture(rasterizer, Splats(**leaves), of)
     (picture * of.gradient).sum().backward()
     return picture.detach(), {name: leaf.grad for name, leaf in leaves.items()}
+
+
+def _picture(rasterizer: Rasterizer, splats: Splats, of: Workload) -> Tensor:
+    options = {"background": of.background, "antialiased": of.antialiased}
+    return rasterizer(splats, of.camera, depth=False, **options).features
+
+
+def save_workload(of: Workload, path: Path) -> None:
+    """Write the workload for another process."""
+    splats = {name: getattr(of.splats, name) for name in LEAVES}
+    camera = {name: getattr(of.camera, name) for name in ("viewmat", "K", "width", "height")}
+    rest = {name: getattr(of, name) for name in ("name", "background", "gradient", "antialiased")}
+    torch.save({"splats": splats, "camera": camera, **rest}, path)
+
+
+def load_workload(path: Path) -> Workload:
+    """What `save_workload` wrote."""
+    stored = torch.load(path, weights_only=True)
+    return Workload(**{**stored, "splats": Splats(**stored["splats"]), "camera": Camera(**stored["camera"])})

@@ -1,0 +1,41 @@
+"""A trained run for a benchmark."""
+
+import io
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from freqgs_plugin.rendering.render import shade
+from freqgs_plugin.reports.bench.options import BenchError
+from freqgs_plugin.reports.bench.workloads import Workload, image_gradient
+
+
+def load(config_path: Path) -> Any:
+    """`studio.checkpoint.load_run` without nerfstudio's remarks.
+
+    Raises:
+        BenchError: there is no such run, or it is of another method.
+    """
+    from freqgs_plugin.studio.checkpoint import load_run
+
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            return load_run(config_path)
+    except (FileNotFoundError, ValueError) as error:
+        raise BenchError(str(error)) from error
+
+
+def views_of(run: Any) -> list[Any]:
+    """The held-out views, or those trained on where none is held out."""
+    return run.cameras("test") or run.cameras("train")
+
+
+@torch.no_grad()
+def trained_workload(run: Any) -> Workload:
+    """The run's splats for its first held-out view, on the CPU."""
+    view = views_of(run)[0]
+    splats, background = shade(run.gaussians, view.camera), run.background
+    there = Workload("trained view", splats, view.camera, background, image_gradient(view.camera), run.antialiased)
+    return there.to("cpu")
