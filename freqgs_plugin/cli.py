@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
+from freqgs_plugin.demo.experiments import EXPERIMENTS
 from freqgs_plugin.reports.bench.commands import BENCHES
 
 
@@ -72,11 +73,15 @@ COMMANDS = {
     "demo": demo,
     "stability": stability,
     "bench": BENCHES,
+    "experiment": EXPERIMENTS,
 }
 """name on the command line -> function, whose signature and docstring become the options and the help, or -> a table of
 such commands"""
 
-GROUPS = {"bench": "Measure times, memory and errors, and write them as JSON, Markdown and pictures."}
+GROUPS = {
+    "bench": "Measure times, memory and errors, and write them as JSON, Markdown and pictures.",
+    "experiment": "Train and measure what a method is said to do, and write it as JSON, Markdown and pictures.",
+}
 """help of each table in COMMANDS"""
 
 
@@ -99,9 +104,10 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _one_of(commands: Mapping[str, Any]) -> Any:
     """The type of which tyro makes subcommands: a union with one member per command."""
-    from tyro.conf import subcommand
+    from tyro.conf import Suppress, subcommand
 
-    members = []
+    # a union of one would be no choice, and ask for no name
+    members: list[Any] = [Annotated[None, Suppress]]
     for name, command in commands.items():
         constructor = command if callable(command) else _group(GROUPS[name], command)
         members.append(Annotated[Any, subcommand(name=name, constructor=constructor)])
@@ -125,9 +131,11 @@ def _expected(error: Exception) -> bool:
     from freqgs_plugin.demo.training import TrainingError
     from freqgs_plugin.io.check_images import SceneError
     from freqgs_plugin.reports.bench.options import BenchError
+    from freqgs_plugin.reports.experiments.options import ExperimentError
     from freqgs_plugin.reports.stability.runner import StabilityError
 
-    return isinstance(error, FileExistsError | TrainingError | SceneError | StabilityError | BenchError)
+    ours = (TrainingError, SceneError, StabilityError, BenchError, ExperimentError)
+    return isinstance(error, (FileExistsError, *ours))
 
 
 if __name__ == "__main__":

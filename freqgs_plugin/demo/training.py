@@ -29,13 +29,20 @@ class TrainingRun:
     output_dir: Path
     steps: int
     seed: int
-    levels: int
+    levels: int | None
+    """of lapsplat; None: the method's default"""
     timestamp: str
+    method: str = "lapsplat"
+    experiment: str = "demo"
+    options: tuple[str, ...] = ()
+    """further arguments of the method"""
+    parser: tuple[str, ...] = ("colmap", "--colmap-path", "sparse/0", "--eval-mode", "interval", "--eval-interval", "8")
+    """how the scene is read"""
 
     @property
     def folder(self) -> Path:
         """What nerfstudio makes of output folder, experiment, method and timestamp."""
-        return self.output_dir / "demo" / "lapsplat" / self.timestamp
+        return self.output_dir / self.experiment / self.method / self.timestamp
 
     @property
     def config_path(self) -> Path:
@@ -43,25 +50,24 @@ class TrainingRun:
 
     def arguments(self, *more: str) -> list[str]:
         """What follows `ns-train`. Evaluation during training is off: the report measures at the end."""
+        levels = () if self.levels is None else ("--pipeline.model.num-levels", str(self.levels))
         return [
-            "lapsplat",
+            self.method,
             *("--data", str(self.scene)),
             *("--output-dir", str(self.output_dir)),
-            *("--experiment-name", "demo"),
+            *("--experiment-name", self.experiment),
             *("--timestamp", self.timestamp),
             *("--max-num-iterations", str(self.steps)),
             *("--steps-per-save", str(max(self.steps // 4, 1))),
             *("--steps-per-eval-image", "0"),
             *("--steps-per-eval-all-images", "0"),
             *("--machine.seed", str(self.seed)),
-            *("--pipeline.model.num-levels", str(self.levels)),
+            *levels,
+            *self.options,
             *("--vis", "tensorboard"),
             *("--logging.local-writer.max-log-size", "0"),
             *more,
-            "colmap",
-            *("--colmap-path", "sparse/0"),
-            *("--eval-mode", "interval"),
-            *("--eval-interval", "8"),
+            *self.parser,
         ]
 
     def resume_hint(self) -> str:

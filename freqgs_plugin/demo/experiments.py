@@ -1,0 +1,143 @@
+"""The commands of `freqgs experiment`: scenes, ns-train and trained runs, handed to the experiments in `reports`.
+
+Heavy imports happen inside of the commands.
+"""
+
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, fields
+from functools import lru_cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from freqgs_plugin.reports.experiments.options import ClodOptions, ExperimentError
+
+if TYPE_CHECKING:
+    from freqgs_plugin.reports.experiments.training import ExperimentScene, Training
+
+Options = Annotated[ClodOptions, tyro.conf.arg(name="")]
+
+
+def clod(options: Options = ClodOptions()) -> None:  # noqa: B008
+    """Train and measure what clodsplat is said to do: quality against count, a plain model, pops, ablations.
+
+    Trains many runs, one at a time: hours for the defaults on a CPU. Whatever is finished is kept, and the same command
+    goes on from there.
+    """
+    import sys
+
+    from rich.console import Console
+
+    from freqgs_plugin.reports.experiments.lab import Tools
+    from freqgs_plugin.reports.experiments.runner import run_clod
+
+    scenes = [scene_of(folder) for folder in options.scenes]
+    if options.demo:
+        scenes.append(demo_scene(options))
+    runs = options.output_dir / "runs"
+    tools = Tools(lambda training, name, on_step: train_run(runs, training, name, on_step), _load, method_defaults)
+    # loading sends standard output to a log; what is for the user keeps going to the terminal
+    run_clod(options, scenes, tools, Console(file=sys.stdout))
+
+
+EXPERIMENTS = {"clod": clod}
+"""name on the command line -> function"""
+
+
+def scene_of(folder: Path) -> "ExperimentScene":
+    """A scene by its folder.
+
+    Raises:
+        ExperimentError: it holds neither a COLMAP model nor a transforms.json.
+    """
+    from freqgs_plugin.reports.experiments.training import ExperimentScene, fingerprint
+
+    folder = folder.resolve()
+    parser_of(folder)
+    return ExperimentScene(folder.name, folder, fingerprint(folder))
+
+
+def demo_scene(options: ClodOptions) -> "ExperimentScene":
+    """The demo scene, ray-traced unless it is there, with a camera that goes from 0.3 to 3.9 m."""
+    from freqgs_plugin.demo.dataset import MANIFEST, SceneOptions, write_scene
+    from freqgs_plugin.demo.scene import build_world, zoom_path
+    from freqgs_plugin.reports.experiments.training import ExperimentScene
+
+    width, height = options.size
+    scene = SceneOptions(num_views=options.views, width=width, height=height)
+    folder = options.output_dir.resolve() / "scenes" / f"demo-{options.views}-{width}x{height}"
+    manifest = folder / MANIFEST
+    written = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
+    identity = {"written_by": "freqgs demo", **asdict(scene)}
+    # the model is written last
+    if written != identity or not (folder / "sparse" / "0" / "points3D.bin").is_file():
+        write_scene(folder, scene)
+    path = zoom_path(build_world(scene.seed), options.frames + 1, width, height)
+    return ExperimentScene("demo", folder, json.dumps(identity, sort_keys=True), tuple(path))
+
+
+def parser_of(folder: Path) -> tuple[str, ...]:
+    """How ns-train reads a scene; every eighth view is held out.
+
+    Raises:
+        ExperimentError: it cannot.
+    """
+    from freqgs_plugin.io.check_scene import find_model
+
+    model = find_model(folder)
+    interval = ("--eval-mode", "interval", "--eval-interval", "8")
+    if model is not None:
+        return ("colmap", "--colmap-path", model, *interval)
+    if (folder / "transforms.json").is_file():
+        return ("nerfstudio-data", *interval)
+    raise ExperimentError(f"{folder} holds neither a COLMAP model nor a transforms.json; name the folder of a scene")
+
+
+def train_run(runs: Path, training: "Training", name: str, on_step: Callable[[int], object]) -> Path:
+    """Train from nothing; what an earlier try left is removed. Returns config.yml.
+
+    Raises:
+        TrainingError: ns-train failed.
+    """
+    from freqgs_plugin.demo.training import TrainingRun, train
+
+    run = TrainingRun(
+        scene=training.scene.folder.resolve(),
+        output_dir=runs.resolve(),
+        steps=training.steps,
+        seed=training.seed,
+        levels=None,
+        timestamp=name,
+        method=training.method,
+        experiment=training.scene.name,
+        options=training.arguments(),
+        parser=parser_of(training.scene.folder),
+    )
+    shutil.rmtree(run.folder, ignore_errors=True)
+    run.output_dir.mkdir(parents=True, exist_ok=True)
+
+    def report(step: int, stage: str | None) -> None:
+        on_step(step)
+
+    train(run, run.output_dir / f"{name}.log", report)
+    return run.config_path
+
+
+@lru_cache
+def method_defaults(method: str) -> Mapping[str, str]:
+    """The fields of a method's model config, and its optimizers, as `repr` shows them."""
+    (found,) = entry_points(group="nerfstudio.method_configs", name=method)
+    config = found.load().config
+    model = config.pipeline.model
+    optimizers = {"optimizers": repr(config.optimizers)}
+    return {**{field.name: repr(getattr(model, field.name)) for field in fields(model)}, **optimizers}
+
+
+def _load(config_path: Path) -> Any:
+    from freqgs_plugin.studio.checkpoint import load_run
+
+    return load_run(config_path)

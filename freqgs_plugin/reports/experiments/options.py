@@ -1,0 +1,84 @@
+"""What `freqgs experiment clod` can be told. Imports nothing heavy: the command line reads it."""
+
+import shlex
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+Section = Literal["curve", "budget", "pops", "ablation", "sigma"]
+SECTIONS: tuple[Section, ...] = get_args(Section)
+
+
+class ExperimentError(RuntimeError):
+    """An experiment that cannot be run as asked; the message holds the remedy."""
+
+
+@dataclass(frozen=True)
+class ClodOptions:
+    """What is trained and measured, and where the results go."""
+
+    output_dir: Path = Path("clod-out")
+    """folder for trained runs, finished steps, clod.json, clod.md and pictures; a second start goes on from there"""
+    scenes: tuple[Path, ...] = ()
+    """folders of scenes, each with a COLMAP model or a transforms.json"""
+    demo: bool = True
+    """also the scene of `freqgs demo`, with a camera that zooms out"""
+    only: tuple[str, ...] = SECTIONS
+    """sections to run: curve, budget, pops, ablation, sigma, with spaces or commas between; others show what the
+    folder holds of them"""
+    steps: int = 3000
+    """training steps of every run"""
+    seeds: int = 1
+    """runs of each setting, with seeds 42, 43 ...; tables show mean and spread. 2 where differences are under 0.3 dB"""
+    s_max: tuple[float, ...] = (1.0, 3.0, 5.0, 7.0)
+    """largest training scales of the sections curve and sigma"""
+    frames: int = 200
+    """steps of each sweep in the section pops"""
+    views: int = 36
+    """photographs of the demo scene"""
+    size: tuple[int, int] = (320, 240)
+    """width and height of the demo scene's photographs, pixels"""
+    docs: Path | None = None
+    """also write the page there, and its pictures into images/ beside it"""
+
+    def __post_init__(self) -> None:
+        if not self.scenes and not self.demo:
+            raise ExperimentError("there is no scene: name folders with --scenes, or leave out --no-demo")
+        if self.steps < 1 or self.seeds < 1 or self.frames < 4:
+            raise ExperimentError(
+                f"--steps and --seeds must be at least 1 and --frames at least 4, not {self.steps}, {self.seeds} and "
+                f"{self.frames}"
+            )
+        if not self.s_max or not all(1 <= s < float("inf") for s in self.s_max):
+            raise ExperimentError(f"--s-max {self.s_max}: name at least one number, each of them 1 or more")
+        names = [folder.resolve().name for folder in self.scenes] + ["demo"] * self.demo
+        if len(set(names)) < len(names):
+            raise ExperimentError(f"scenes are told apart by the names of their folders, and these are: {names}")
+        _ = self.sections
+
+    @property
+    def sections(self) -> tuple[Section, ...]:
+        """What `only` names, in the usual order."""
+        named = [name for item in self.only for name in item.split(",") if name]
+        unknown = [name for name in named if name not in SECTIONS]
+        if unknown or not named:
+            raise ExperimentError(f"--only {' '.join(self.only)}: choose among {', '.join(SECTIONS)}")
+        return tuple(name for name in SECTIONS if name in named)
+
+
+def command_line(options: ClodOptions) -> str:
+    """The command that makes the same page; scenes by name, without the folders that it writes to."""
+    command = ["freqgs", "experiment", "clod"]
+    for field in fields(options):
+        value: Any = getattr(options, field.name)
+        if value == field.default or field.name in ("output_dir", "docs", "only"):
+            continue
+        name = field.name.replace("_", "-")
+        if isinstance(value, bool):
+            command.append(f"--{name}" if value else f"--no-{name}")
+        elif field.name == "scenes":
+            command += ["--scenes", *(folder.resolve().name for folder in value)]
+        else:
+            values = value if isinstance(value, tuple) else (value,)
+            command += [f"--{name}", *(f"{v:g}" for v in values)]
+    return shlex.join(command)

@@ -1,0 +1,275 @@
+"""Does anything jump as detail falls? Changes from frame to frame, beside a switch between two models (Figure 6)."""
+
+import math
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from freqgs_plugin.functional.attenuation import Attenuation, DistanceDecay, Reference
+from freqgs_plugin.io.init_source import TRANSFORMS, read_frame
+from freqgs_plugin.reports.bench.tables import BenchTable, Row
+from freqgs_plugin.reports.drawing import HeldOutView, TrainedRun, draw
+from freqgs_plugin.reports.experiments import dolly
+from freqgs_plugin.reports.experiments.goals import Goal
+from freqgs_plugin.reports.experiments.lab import Lab, LoadedRun
+from freqgs_plugin.reports.experiments.measures import Changes, at_scale, changes, neighbours
+from freqgs_plugin.reports.experiments.options import ClodOptions
+from freqgs_plugin.reports.experiments.plots import COLOURS, GREY, panels
+from freqgs_plugin.reports.experiments.section import Part, Results
+from freqgs_plugin.reports.experiments.seeds import mean, shown
+from freqgs_plugin.reports.experiments.training import DEFAULT_SCALE, Trial
+from freqgs_plugin.reports.tables import psnr
+from freqgs_plugin.types import Camera, Gaussians
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+REFERENCES: tuple[Reference, ...] = ("scene", "frustum_max", "frustum_quantile")
+DEFAULT = "soft, scene"
+SWITCH = "two models, switched halfway"
+CAMERA = "nothing fades"
+HELD_SCALE = (1 + DEFAULT_SCALE) / 2
+"""s_v along the dolly"""
+BY_MEDIAN, BY_SWITCH = 3.0, 0.1
+"""the largest change may be so many times the median one, and this part of the switch's"""
+PATHS = {
+    "sweep": f"s_v from 1 to {DEFAULT_SCALE:g}, fixed camera",
+    "dolly": f"dolly at s_v {HELD_SCALE:g}",
+    "fading": f"dolly at s_v {HELD_SCALE:g}, fading alone",
+}
+
+INTRODUCTION = f"""\
+Neighbouring frames, compared: the mean absolute difference over pixels and colours, in grey levels of 255, and the
+largest one of any pixel. One clodsplat model (s_max {DEFAULT_SCALE:g}), with the soft and the hard cut and the three
+distance references, beside two discrete models that are switched halfway: a plain model, and a second one that was
+trained with at most as many Gaussians as clodsplat draws at s_v = {DEFAULT_SCALE:g}.
+
+* *sweep*: s_v rises from 1 to {DEFAULT_SCALE:g} in equal steps, seen from the middle held-out view.
+* *dolly*: the camera goes away in a straight line, distance growing more than tenfold by equal factors, at s_v =
+  {HELD_SCALE:g}. In the demo scene from the dice to the wall; elsewhere on the line through the middle held-out view
+  and what it looks at. The camera's own motion changes every frame: *{CAMERA}* shows how much.
+* *fading alone*: each frame of the dolly against the same frame with the weights of the frame before, so without the
+  camera's motion."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """Weights that are known already."""
+
+    weight: Tensor
+
+    def __call__(self, gaussians: Gaussians, camera: Camera) -> Tensor:
+        return self.weight
+
+
+def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
+    """All three paths."""
+    clod, plain = trial.clod(), trial.plain()
+
+    def do() -> dict[str, Any]:
+        views = lab.run(clod).cameras("test")
+        fewest = statistics.fmean(_drawn(lab.run(clod), view, DEFAULT_SCALE) for view in views)
+        coarse = trial.plain(max_gaussians=max(round(fewest), 1))
+        models = [lab.run(plain), lab.run(coarse)]
+        run, view = lab.run(clod), views[len(views) // 2]
+        if trial.scene.dolly is None:
+            cameras = dolly.made_from(run, view.camera, options.frames + 1)
+        else:
+            frame = read_frame(lab.config_path(clod).parent / TRANSFORMS)
+            cameras = [dolly.in_frame(camera, frame, run.background.device) for camera in trial.scene.dolly]
+        total = 3 * len(variants(run)) + 3
+        with lab.progress.task(f"{trial.scene.name}: frames", total) as advance:
+            return jumps(run, models, view, cameras, options.frames, advance)
+
+    more = {"frames": options.frames, "scale": HELD_SCALE, "coarse": "as many as are drawn at s_max"}
+    return lab.step("pops", [clod, plain], more, do)
+
+
+def _drawn(run: LoadedRun, view: HeldOutView, scale: float) -> int:
+    return int((at_scale(run, scale)(run.gaussians, view.camera) > 0).sum())
+
+
+def variants(run: LoadedRun) -> dict[str, Callable[[float], DistanceDecay]]:
+    """Name -> attenuation at a scale, for both cuts and all references."""
+    distance = at_scale(run, 1.0).scene_distance
+    return {
+        f"{'soft' if soft else 'hard'}, {reference}": lambda s, soft=soft, reference=reference: DistanceDecay(
+            s, reference, distance if reference == "scene" else None, soft
+        )
+        for soft in (True, False)
+        for reference in REFERENCES
+    }
+
+
+def jumps(
+    run: LoadedRun,
+    models: Sequence[TrainedRun],
+    view: HeldOutView,
+    cameras: Sequence[Camera],
+    steps: int,
+    advance: Callable[[int], object] = lambda done: None,
+) -> dict[str, Any]:
+    """Path -> variant -> changes; PSNR along the sweep; `models` are the finer and the coarser one."""
+    scales = torch.linspace(1, DEFAULT_SCALE, steps + 1).tolist()
+    target = view.image.to(run.background)
+    found: dict[str, Any] = {path: {} for path in PATHS}
+    curves: dict[str, list[float]] = {}
+    done = 0
+    for name, at in variants(run).items():
+        found["sweep"][name], curves[name] = _sweep((_shown(run, view.camera, at(scale)) for scale in scales), target)
+        found["dolly"][name] = _record(changes(neighbours(_shown(run, camera, at(HELD_SCALE)) for camera in cameras)))
+        found["fading"][name] = _record(changes(fading_alone(run, cameras, at(HELD_SCALE))))
+        done += 3
+        advance(done)
+    fixed = [_shown(model, view.camera) for model in models]
+    found["sweep"][SWITCH], curves[SWITCH] = _sweep((fixed[_model(i, len(scales))] for i in range(len(scales))), target)
+    which = [models[_model(i, len(cameras))] for i in range(len(cameras))]
+    frames = (_shown(model, camera) for model, camera in zip(which, cameras, strict=True))
+    found["dolly"][SWITCH] = _record(changes(neighbours(frames)))
+    found["dolly"][CAMERA] = _record(changes(neighbours(_shown(run, camera) for camera in cameras)))
+    alone = (
+        (_shown(before, camera), _shown(after, camera)) if before is not after else _still(camera)
+        for before, after, camera in zip(which, which[1:], cameras[1:], strict=False)
+    )
+    found["fading"][SWITCH] = _record(changes(alone))
+    advance(done + 3)
+    return {
+        "paths": found,
+        "psnr": curves,
+        "scales": scales,
+        "gaussians": {"clodsplat": len(run.gaussians), "models": [len(model.gaussians) for model in models]},
+    }
+
+
+def fading_alone(
+    run: TrainedRun, cameras: Sequence[Camera], attenuation: Attenuation
+) -> Iterable[tuple[Tensor, Tensor]]:
+    """Each frame with the weights of the frame before, and with its own."""
+    weights = [attenuation(run.gaussians, camera) for camera in cameras[:1]]
+    for camera in cameras[1:]:
+        weights = [weights[-1], attenuation(run.gaussians, camera)]
+        before, after = (_shown(run, camera, Given(weight)) for weight in weights)
+        yield before, after
+
+
+def _model(frame: int, count: int) -> int:
+    """0 in the first half of the frames, 1 in the second."""
+    return int(frame >= count // 2)
+
+
+def _still(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Two frames without a difference."""
+    nothing = camera.K.new_zeros(camera.height, camera.width, 3)
+    return nothing, nothing
+
+
+@torch.no_grad()
+def _shown(run: TrainedRun, camera: Camera, attenuation: Attenuation | None = None) -> Tensor:
+    return draw(run, camera, attenuation).features.clamp(0, 1)
+
+
+def _sweep(frames: Iterable[Tensor], target: Tensor) -> tuple[dict[str, Any], list[float]]:
+    """Changes, and PSNR of every frame."""
+    curve: list[float] = []
+
+    def noted() -> Iterable[Tensor]:
+        for frame in frames:
+            curve.append(psnr(frame, target))
+            yield frame
+
+    return _record(changes(neighbours(noted()))), curve
+
+
+def _record(found: Changes) -> dict[str, Any]:
+    names = ("largest", "mean", "median", "largest_by_median")
+    return {**asdict(found), **{name: getattr(found, name) for name in names}}
+
+
+def tables(scene: str, results: Results) -> list[BenchTable]:
+    """One row per path and variant."""
+    rows: list[Row] = []
+    for path, title in PATHS.items():
+        for name in results[0]["paths"][path]:
+            seeds = [result["paths"][path][name] for result in results]
+            rows.append({"path": title, "variant": name + (" (default)" if name == DEFAULT else ""), "seeds": seeds})
+
+    def column(name: str, form: str) -> Callable[[Row], str]:
+        return lambda row: shown(row["seeds"], lambda s: s[name], form)
+
+    counts = [
+        f"{mean(results, get):,.0f}"
+        for get in (
+            lambda r: r["gaussians"]["clodsplat"],
+            lambda r: r["gaussians"]["models"][0],
+            lambda r: r["gaussians"]["models"][1],
+        )
+    ]
+    return [
+        BenchTable(
+            f"clod-pops-{scene}",
+            f"{scene}: changes between neighbouring frames, grey levels of 255",
+            rows,
+            [
+                ("path", lambda row: row["path"]),
+                ("variant", lambda row: row["variant"]),
+                ("largest", column("largest", ".3f")),
+                ("median", column("median", ".3f")),
+                ("mean", column("mean", ".3f")),
+                ("largest / median", column("largest_by_median", ".1f")),
+                ("worst pixel", column("worst_pixel", ".1f")),
+            ],
+            f"Gaussians: clodsplat {counts[0]}, the two models {counts[1]} and {counts[2]}. A dash: the median is 0.",
+        )
+    ]
+
+
+def goals(scene: str, results: Results) -> list[Goal]:
+    """On every path: the default's largest change against its median, and against the switch."""
+    found = []
+    for path, title in PATHS.items():
+        ours = [result["paths"][path][DEFAULT] for result in results]
+        largest, median = (mean(ours, lambda s, n=n: s[n]) for n in ("largest", "median"))
+        switch = mean(results, lambda r, p=path: r["paths"][p][SWITCH]["largest"])
+        found.append(
+            change_goal(
+                scene, f"{title}: largest change at most {BY_MEDIAN:g} x the median", largest, median, BY_MEDIAN
+            )
+        )
+        text = f"{title}: largest change at most {BY_SWITCH:g} x that of switching models"
+        found.append(change_goal(scene, text, largest, switch, BY_SWITCH))
+    return found
+
+
+def change_goal(scene: str, text: str, largest: float, against: float, bound: float) -> Goal:
+    """`largest` <= `bound` * `against`; without any change at all the goal is reached."""
+    ratio = largest / against if against > 0 else math.inf if largest > 0 else 0.0
+    return Goal(scene, text, f"{ratio:.2f} x ({largest:.3f} against {against:.3f})", largest <= bound * against)
+
+
+def figures(scene: str, results: Results) -> "dict[str, Figure]":
+    """Changes and PSNR along the paths, of the first seed."""
+    result = results[0]
+    figure, axes = panels(2, 2)
+    lines = {DEFAULT: (COLOURS[0], "-"), "hard, scene": (COLOURS[1], "-"), "soft, frustum_max": (COLOURS[2], "-")}
+    lines |= {SWITCH: ("#000000", "--"), CAMERA: (GREY, ":")}
+    for name, (colour, style) in lines.items():
+        if name in result["psnr"]:
+            axes[0].plot(result["scales"], result["psnr"][name], color=colour, ls=style, lw=1.2, label=name)
+        for each, path in zip(axes[1:], PATHS, strict=True):
+            if name in result["paths"][path]:
+                each.plot(result["paths"][path][name]["each"], color=colour, ls=style, lw=1, label=name)
+    axes[0].set(title=PATHS["sweep"], xlabel="s_v", ylabel="PSNR, dB")
+    for each, title in zip(axes[1:], PATHS.values(), strict=True):
+        each.set(title=title, xlabel="frame", ylabel="change, grey levels")
+        each.set_yscale("symlog", linthresh=0.01)
+        each.set_ylim(bottom=0)
+    axes[2].legend(fontsize=7)
+    figure.suptitle(f"{scene}: changes from frame to frame", fontsize=11)
+    return {"": figure}
+
+
+PART = Part("pops", "Does anything pop?", INTRODUCTION, measure, tables, figures, goals)

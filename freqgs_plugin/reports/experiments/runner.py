@@ -1,0 +1,121 @@
+"""`freqgs experiment clod`: runs sections scene by scene, seed by seed; writes JSON, Markdown and pictures."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from freqgs_plugin.reports.bench.runner import IMAGES, png, write_all
+from freqgs_plugin.reports.experiments import ablation, budget, curve, pops, sigma
+from freqgs_plugin.reports.experiments.goals import goal_table
+from freqgs_plugin.reports.experiments.lab import Lab, Missing, Tools
+from freqgs_plugin.reports.experiments.options import SECTIONS, ClodOptions, command_line
+from freqgs_plugin.reports.experiments.page import Shown, markdown_page
+from freqgs_plugin.reports.experiments.progress import Bars, Silent
+from freqgs_plugin.reports.experiments.section import Part, Results
+from freqgs_plugin.reports.experiments.store import Store
+from freqgs_plugin.reports.experiments.training import ExperimentScene, Trial
+from freqgs_plugin.reports.tables import finite_json
+from freqgs_plugin.reports.timing import environment
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+PARTS: Mapping[str, Part] = {p.name: p for p in (curve.PART, budget.PART, pops.PART, ablation.PART, sigma.PART)}
+FIRST_SEED = 42
+
+
+def run_clod(options: ClodOptions, scenes: Sequence[ExperimentScene], tools: Tools, console: "Console") -> list[Shown]:
+    """Do what is not done yet, and print the goals. After each section all that is known for these settings is written.
+
+    Raises:
+        KeyboardInterrupt: passed on, after a message on how to go on.
+    """
+    out = options.output_dir
+    out.mkdir(parents=True, exist_ok=True)
+    store, log = Store(out / "steps"), out / "load.log"
+    shown: list[Shown] = []
+    files: dict[Path, bytes] = {}
+    try:
+        with Bars(console, "freqgs experiment clod", len(options.sections) * len(scenes) * options.seeds) as bars:
+            lab = Lab(store, tools, bars, log)
+            for name in options.sections:
+                for scene in scenes:
+                    for trial in trials(options, scene):
+                        bars.part(f"{name}: {scene.name}, seed {trial.seed}")
+                        PARTS[name].measure(lab, trial, options)
+                        bars.advance()
+                finished = Lab(store, tools, Silent(), log, only_finished=True)
+                shown = collect(options, scenes, finished)
+                files = _files(options, _record(options, finished), shown)
+                write_all(files)
+    except KeyboardInterrupt:
+        _say(console, f"Stopped. What is finished is kept in {store.folder}; the same command goes on from there.")
+        raise
+    goals = [goal for each in shown for goal in each.goals()]
+    if goals:
+        console.print(goal_table(goals))
+    for path in files:
+        _say(console, str(path))
+    return shown
+
+
+def trials(options: ClodOptions, scene: ExperimentScene) -> list[Trial]:
+    """One per seed."""
+    return [Trial(scene, options.steps, FIRST_SEED + i) for i in range(options.seeds)]
+
+
+def collect(options: ClodOptions, scenes: Sequence[ExperimentScene], lab: Lab) -> list[Shown]:
+    """All sections, scene by scene, that are finished for every seed; `lab` does nothing anew."""
+    shown = []
+    for name in SECTIONS:
+        results: dict[str, Results] = {}
+        for scene in scenes:
+            try:
+                results[scene.name] = [PARTS[name].measure(lab, t, options) for t in trials(options, scene)]
+            except Missing:
+                continue
+        if results:
+            shown.append(Shown(PARTS[name], results))
+    return shown
+
+
+def _record(options: ClodOptions, lab: Lab) -> dict[str, Any]:
+    used = list(lab.used.values())
+    return {
+        **environment(),
+        "command": command_line(options),
+        "options": {**asdict(options), "scenes": [folder.resolve().name for folder in options.scenes]},
+        "seeds": [FIRST_SEED + i for i in range(options.seeds)],
+        "dates": sorted({record["date"][:10] for record in used}),
+        "commits": sorted({str(record["commit"]) for record in used}),
+        "hours": sum(record["seconds"] for record in used) / 3600,
+    }
+
+
+def _files(options: ClodOptions, record: dict[str, Any], shown: Sequence[Shown]) -> dict[Path, bytes]:
+    """Path -> contents of everything that is written."""
+    for path in ("output_dir", "docs"):
+        record["options"].pop(path)
+    report = {
+        **record,
+        "goals": [{**asdict(goal)} for each in shown for goal in each.goals()],
+        "sections": {each.part.name: each.results for each in shown},
+    }
+    out, pictures = options.output_dir, {}
+    for each in shown:
+        pictures |= {name: png(figure) for name, figure in each.figures().items()}
+    files = {
+        out / "clod.json": json.dumps(finite_json(report), indent=1, allow_nan=False).encode() + b"\n",
+        out / "clod.md": markdown_page(record, shown, "").encode(),
+        **{out / name: picture for name, picture in pictures.items()},
+    }
+    if options.docs is not None:
+        files[options.docs] = markdown_page(record, shown, f"{IMAGES}/").encode()
+        files |= {options.docs.parent / IMAGES / name: picture for name, picture in pictures.items()}
+    return files
+
+
+def _say(console: "Console", text: str) -> None:
+    console.print(text, soft_wrap=True, highlight=False, markup=False)

@@ -1,0 +1,54 @@
+"""Finished steps on disk: one JSON file each, found again by its settings. A step that was interrupted left none."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from freqgs_plugin.reports.bench.runner import write_all
+from freqgs_plugin.reports.experiments.options import ExperimentError
+from freqgs_plugin.reports.tables import finite_json
+from freqgs_plugin.reports.timing import environment
+
+
+@dataclass(frozen=True)
+class Store:
+    """A folder of finished steps."""
+
+    folder: Path
+
+    def path(self, name: str, settings: dict[str, Any]) -> Path:
+        """The file of a step: `name` and a hash of its settings."""
+        return self.folder / f"{name}-{key(settings)}.json"
+
+    def read(self, name: str, settings: dict[str, Any]) -> dict[str, Any] | None:
+        """The record of a finished step: `result`, `seconds` and circumstances; None where it is not finished.
+
+        Raises:
+            ExperimentError: the file is damaged.
+        """
+        path = self.path(name, settings)
+        if not path.is_file():
+            return None
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ExperimentError(f"{path} is damaged ({error}); remove it, and the step is done again") from error
+        return record if record.get("settings") == _as_json(settings) else None
+
+    def write(self, name: str, settings: dict[str, Any], result: Any, seconds: float) -> dict[str, Any]:
+        """Save a finished step in one piece, and return its record as `read` would. Infinite numbers become null."""
+        record = {**environment(), "name": name, "seconds": round(seconds, 1), "settings": settings, "result": result}
+        text = json.dumps(finite_json(record), indent=1, allow_nan=False)
+        write_all({self.path(name, settings): text.encode() + b"\n"})
+        return json.loads(text)
+
+
+def key(settings: dict[str, Any]) -> str:
+    """Twelve hexadecimal digits that depend on the settings, not on their order."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _as_json(settings: dict[str, Any]) -> Any:
+    return json.loads(json.dumps(settings))
