@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import pytest
 import scenes
 import torch
 
-from freqgs_plugin.functional.attenuation import LevelCut
+from freqgs_plugin.functional.attenuation import DistanceDecay, LevelCut
 from freqgs_plugin.rendering.numba_backend import NumbaRasterizer
 from freqgs_plugin.rendering.render import render, render_prefixes, rendered_weight
 from freqgs_plugin.rendering.torch_backend import TorchRasterizer
@@ -94,3 +96,59 @@ def test_what_is_covered_or_outside_weighs_nothing(rasterizer):
     )
     weight = rendered_weight(g, scenes.camera(width=9, height=9, dtype=torch.float32), 1, rasterizer=rasterizer)
     assert weight[0] > 50 and weight[1] < 0.1 and weight[2] == 0
+
+
+def fading():
+    """Decays from 0.05 to 20: about half of these Gaussians are hidden."""
+    g = gaussians()
+    return replace(g, decay=torch.logspace(-1.3, 1.3, len(g)), level=torch.ones_like(g.level))
+
+
+def test_training_and_viewing_show_the_same_fading(rasterizer, assert_close):
+    g, decay = fading(), DistanceDecay(1.5, "frustum_max", soft=False)
+    background = torch.tensor([0.2, 0.4, 0.6])
+    (trained,) = render_prefixes(g, CAMERA, 1, decay, rasterizer=rasterizer, background=background)
+    seen = render(g, CAMERA, decay, rasterizer=rasterizer, background=background)
+    assert 0 < trained.info["drawn"] == seen.info["drawn"] < len(g)
+    assert_close(trained.features, seen.features, loosen=0.1)
+    everything = render(g, CAMERA, rasterizer=rasterizer, background=background)
+    assert float((everything.features - seen.features).abs().max()) > 0.1
+
+
+def test_rows_of_weight_0_stay_and_count_as_not_seen(rasterizer):
+    g, decay = fading(), DistanceDecay(1.5, "frustum_max")
+    g.means.requires_grad_()
+    shown = decay(g, CAMERA) > 0
+    (with_decay,) = render_prefixes(g, CAMERA, 1, decay, rasterizer=rasterizer)
+    (without,) = render_prefixes(g, CAMERA, 1, rasterizer=rasterizer)
+    assert with_decay.info["radii"].shape == without.info["radii"].shape == (1, len(g))
+    assert bool((with_decay.info["radii"][0, ~shown] == 0).all())
+    assert torch.equal(with_decay.info["radii"][0, shown], without.info["radii"][0, shown])
+    assert bool((without.info["radii"][0, ~shown] > 0).any())
+    with_decay.features.square().sum().backward()
+    means2d = with_decay.info["means2d"]
+    assert bool((means2d.grad[0, ~shown] == 0).all()) and bool((means2d.grad[0, shown] != 0).any())
+    assert bool((g.means.grad[~shown] == 0).all())
+
+
+def test_nothing_to_draw_is_the_background(rasterizer):
+    g = replace(fading(), decay=torch.full((40,), -1.0))
+    g.means.requires_grad_()
+    background = torch.tensor([0.2, 0.4, 0.6])
+    decay = DistanceDecay(2.0, "frustum_max")
+    (trained,) = render_prefixes(g, CAMERA, 1, decay, rasterizer=rasterizer, background=background)
+    trained.features.sum().backward()
+    seen = render(g, CAMERA, decay, rasterizer=rasterizer, background=background)
+    assert trained.info["drawn"] == seen.info["drawn"] == 0
+    assert torch.equal(trained.features, background.expand_as(trained.features))
+    assert torch.equal(seen.features, trained.features)
+    assert bool((g.means.grad == 0).all()) and bool((trained.info["means2d"].grad == 0).all())
+
+
+def test_rendered_weights_fade_with_distance(rasterizer):
+    g, decay = fading(), DistanceDecay(1.5, "frustum_max")
+    weight = rendered_weight(g, CAMERA, 1, decay, rasterizer=rasterizer)
+    shown = decay(g, CAMERA) > 0
+    assert bool((weight[~shown] == 0).all())
+    expected = rendered_weight(g.select(shown), CAMERA, 1, decay, rasterizer=rasterizer)
+    torch.testing.assert_close(weight[shown], expected, rtol=1e-3, atol=1e-4)

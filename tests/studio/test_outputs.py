@@ -79,3 +79,17 @@ def test_a_failure_is_not_kept_as_a_value(later):
 def test_a_copy_holds_values(outputs):
     assert torch.equal(copy.copy(outputs)["prefix_1"], torch.ones(2))
     assert torch.equal(outputs.copy()["prefix_1"], torch.ones(2))
+
+
+def test_numbers_are_noted_when_a_value_is_made():
+    notes = {}
+
+    def note():
+        notes["count"] = 3.0
+        return torch.zeros(2)
+
+    outputs = LazyOutputs({}, {"detail_2": note}, notes)
+    assert outputs.notes == {}
+    outputs["detail_2"]
+    assert outputs.notes == {"count": 3.0} and list(outputs) == ["detail_2"]
+    assert LazyOutputs({}, {}).notes == {}

@@ -40,3 +40,14 @@ def test_sh_degree_grows_to_its_maximum():
 )
 def test_scaled(steps, scale, least, expected):
     assert scaled(steps, scale, least) == expected
+
+
+def test_views_are_looked_at_on_resets_and_when_refinement_ends():
+    assert [step for step in range(3500) if schedule().looks_at_views(step)] == [*range(300, 3000, 300), 3000]
+
+
+def test_opacities_recover_after_each_reset():
+    s = schedule(reset_stop=700)
+    # step 300 itself trains before its reset, but is counted with it
+    assert [step for step in range(3000) if s.recovers(step)] == [*range(300, 361), *range(600, 661)]
+    assert not any(schedule(reset_stop=100).recovers(step) for step in range(3000))
