@@ -36,8 +36,9 @@ class FreqSplatModelConfig(SplatfactoModelConfig):
     """weight of the mean opacity in the loss: Gaussians that no picture needs fade and are pruned; 0: none (ours)"""
     size_penalty: float = 0.0
     """weight of the mean standard deviation, world units, in the loss; 0: none (ours)"""
-    dropout: float = 0.0
-    """share of Gaussians that each training step leaves out at random, in [0, 1); 0: none (ours)"""
+    dropout: float | None = 0.0
+    """share of Gaussians that each training step leaves out at random, in [0, 1); 0: none; None: 0.1 if fewer than 25
+    views train, else none (ours)"""
     max_gaussians: int = 0
     """densification stops at this many Gaussians; 0: no bound (ours)"""
     steps_scale: float | None = None

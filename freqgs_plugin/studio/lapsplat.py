@@ -52,8 +52,9 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """lambda_k of the image term for prefixes k < m (Eq. 12; ours, the paper: 0.1); 0 leaves them out"""
     growth: Growth = "newest"
     """which Gaussians may grow: all (the paper), the newest level's (ours), or each level from its own_prefix"""
-    dropout: float = 0.1
-    """share of Gaussians that each training step leaves out at random, in [0, 1); 0: none (ours)"""
+    dropout: float | None = None
+    """share of Gaussians that each training step leaves out at random, in [0, 1); 0: none; None: 0.1 if fewer than 25
+    views train, else none (ours)"""
     opacity_penalty: float = 0.01
     """weight of the mean opacity in the loss: Gaussians that no picture needs fade and are pruned; 0: none (ours)"""
     size_penalty: float = 0.01

@@ -20,7 +20,7 @@ from freqgs_plugin.studio.targets import TargetCache, ViewTarget
 from freqgs_plugin.studio.viewing import SplatViews, psnr, show
 from freqgs_plugin.training.densify import LevelStrategy
 from freqgs_plugin.training.guard import FiniteGuard, NonFiniteError
-from freqgs_plugin.training.regularise import drop_out, mean_opacity, mean_size
+from freqgs_plugin.training.regularise import default_dropout, drop_out, mean_opacity, mean_size
 from freqgs_plugin.training.schedule import REFERENCE_STEPS, Schedule, scaled
 from freqgs_plugin.types import Camera, Gaussians, Rendering
 
@@ -180,8 +180,11 @@ class FreqSplatModel(SplatViews):
 
     def _training_outputs(self, camera: Camera, background: Tensor, cam_idx: int | None) -> dict[str, Any]:
         gaussians = self.gaussians()
-        if self.config.dropout > 0:
-            kept = drop_out(gaussians.opacities, self.config.dropout, self.config.seed, self.step)
+        rate = self.config.dropout
+        if rate is None:
+            rate = default_dropout(self.num_train_data)
+        if rate > 0:
+            kept = drop_out(gaussians.opacities, rate, self.config.seed, self.step)
             gaussians = replace(gaussians, opacities=kept)
         renderings = self._training_renderings(gaussians, camera, background)
         self._info = renderings[-1].info

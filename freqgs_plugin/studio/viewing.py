@@ -77,7 +77,7 @@ class SplatViews(SplatfactoModel):
             raise ValueError(f"sh_degree is {self.config.sh_degree}; it must be in 0..4.")
         if self.config.rasterize_mode not in ("antialiased", "classic"):
             raise ValueError(f"rasterize_mode is '{self.config.rasterize_mode}'; choose antialiased or classic.")
-        if not 0 <= self.config.dropout < 1:
+        if self.config.dropout is not None and not 0 <= self.config.dropout < 1:
             raise ValueError(f"dropout is {self.config.dropout}; it is a share of the Gaussians, in [0, 1).")
 
     def _initial_parameters(self) -> dict[str, torch.nn.Parameter]:

@@ -20,6 +20,15 @@ def mean_size(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
     return torch.exp(log_scales).sum() / max(log_scales.numel(), 1)
 
 
+FEW_VIEWS = 25
+"""under this many training views, dropout helped; with more it cost quality"""
+
+
+def default_dropout(num_views: int) -> float:
+    """Share to drop in training on so many views."""
+    return 0.1 if num_views < FEW_VIEWS else 0.0
+
+
 def drop_out(opacities: Float[Tensor, " n"], rate: float | int, seed: int, step: int) -> Float[Tensor, " n"]:
     """Opacities with a random share `rate` set to 0 and the others divided by 1 - rate: the mean stays.
 

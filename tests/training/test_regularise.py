@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from freqgs_plugin.training.regularise import drop_out, mean_opacity, mean_size
+from freqgs_plugin.training.regularise import FEW_VIEWS, default_dropout, drop_out, mean_opacity, mean_size
 
 
 def test_penalties_are_means_of_what_is_drawn():
@@ -44,3 +44,8 @@ def test_dropout_depends_on_seed_and_step_alone():
 def test_rate_0_changes_nothing():
     opacities = torch.rand(10)
     assert torch.equal(drop_out(opacities, 0.0, 0, 0), opacities)
+
+
+def test_only_few_views_call_for_dropout():
+    assert default_dropout(FEW_VIEWS - 1) == 0.1
+    assert default_dropout(FEW_VIEWS) == 0
