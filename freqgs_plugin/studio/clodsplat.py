@@ -87,8 +87,8 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     code writes it. Runs say it themselves"""
     init_refine: bool = False
     """densify, prune and reset opacities in a run that starts from Gaussians"""
-    export_distance: float = 0.5
-    """ns-export writes opacities as seen from this normalised distance: a plain 3DGS scene cannot fade"""
+    export_distance: float = 0.7
+    """ns-export writes opacities as seen from this normalised distance: a plain 3DGS scene cannot fade (ours)"""
 
 
 class ClodSplatModel(FreqSplatModel):
