@@ -1,10 +1,11 @@
 """Runs nerfstudio's commands, and its trainer step by step."""
 
 import os
-import resource
 import shutil
 import subprocess
 import sys
+import tempfile
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,23 +37,34 @@ def command(name, *arguments, timeout=200, folder=None):
     program = str(beside) if beside.exists() else shutil.which(name)
     assert program, f"{name} is not installed"
     environment = {**os.environ, "TERM": "dumb"}
-    done = subprocess.run(
-        [program, *map(str, arguments)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        timeout=timeout,
-        env=environment,
-        cwd=folder,
-    )
-    return Finished(done.returncode, done.stdout)
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(
+            [program, *map(str, arguments)],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            cwd=folder,
+        )
+        alarm = threading.Timer(timeout, process.kill)
+        alarm.start()
+        if hasattr(os, "wait4"):
+            _, status, usage = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            _peaks.append(usage.ru_maxrss / 2**20)
+        else:
+            process.wait()
+        alarm.cancel()
+        output.seek(0)
+        return Finished(process.returncode, output.read().decode(errors="replace"))
+
+
+_peaks = [0.0]
 
 
 def peak_gigabytes():
     """The most memory that any command so far had resident (Linux counts in kB)."""
-    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+    return max(_peaks)
 
 
 def train_arguments(scene, output, *more, timestamp="run", method="lapsplat"):
@@ -60,6 +72,8 @@ def train_arguments(scene, output, *more, timestamp="run", method="lapsplat"):
         *(method, "--data", scene, "--output-dir", output, "--experiment-name", "small", "--timestamp", timestamp),
         *("--steps-per-eval-image", "60", "--steps-per-eval-batch", "50", "--steps-per-eval-all-images", "149"),
         *("--pipeline.model.steps-scale", SCALE, "--pipeline.model.least-refine-interval", EVERY),
+        # runs of 150 steps: nothing but the pictures counts
+        *("--pipeline.model.dropout", 0, "--pipeline.model.opacity-penalty", 0, "--pipeline.model.size-penalty", 0),
         *("--vis", "tensorboard"),
         *more,
         *("colmap", "--eval-mode", "interval", "--eval-interval", "4"),

@@ -29,9 +29,10 @@ class TestStages:
             seen.append((metrics["stage"], metrics["width"], metrics["height"], tuple(sorted(losses))))
             consistent(trainer)
         w, h = SIZE
-        assert seen[:10] == [(1, w // 4, h // 4, ("image_1",))] * 10
-        assert seen[10:20] == [(2, w // 2, h // 2, ("dft", "image_1", "image_2"))] * 10
-        assert seen[20:] == [(3, w, h, ("dft", "image_1", "image_2", "image_3"))] * 10
+        penalties = ("opacity", "size")
+        assert seen[:10] == [(1, w // 4, h // 4, ("image_1", *penalties))] * 10
+        assert seen[10:20] == [(2, w // 2, h // 2, ("dft", "image_1", "image_2", *penalties))] * 10
+        assert seen[20:] == [(3, w, h, ("dft", "image_1", "image_2", "image_3", *penalties))] * 10
         assert model.level_counts() == [metrics[f"gaussians_level_{k}"] for k in (1, 2, 3)]
         assert sum(model.level_counts()) == metrics["gaussian_count"] == model.num_points
         begins = [line for line in said if "begins" in line]
@@ -503,7 +504,7 @@ class TestAbsurd:
 
     def test_an_empty_view(self, make_trainer):
         """All Gaussians behind every camera: nothing to learn from, but no error either."""
-        trainer = make_trainer(**SHORT)
+        trainer = make_trainer(**SHORT, opacity_penalty=0.0, size_penalty=0.0)
         model = trainer.pipeline.model
         with torch.no_grad():
             model.gauss_params["means"] += 1e4
