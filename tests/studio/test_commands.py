@@ -343,8 +343,9 @@ class TestClodsplat:
         tags = {f"Train Metrics Dict/{k}" for k in ("scale", "drawn_share", "decay_mean", "dead_decay")}
         assert tags | {"Train Loss Dict/count"} <= set(events.Tags()["scalars"])
         assert {e.step >= DECAY_START for e in events.Scalars("Train Metrics Dict/scale")} == {True}
-        loss = [e.value for e in events.Scalars("Train Loss Dict/image_1")]
-        assert np.mean(loss[-3:]) < 0.6 * loss[0], loss
+        psnr = [e.value for e in events.Scalars("Train Metrics Dict/psnr")]
+        # by view and scale these go up and down; untrained, none is above 13.6 dB
+        assert max(psnr) > 15, psnr
 
     def test_eval(self, faded, tmp_path):
         done = command("ns-eval", "--load-config", faded, "--output-path", tmp_path / "eval.json")
