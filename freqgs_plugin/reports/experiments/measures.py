@@ -17,6 +17,8 @@ from freqgs_plugin.reports.experiments.options import ExperimentError
 from freqgs_plugin.reports.tables import psnr
 
 GREY_LEVELS = 255.0
+AROUND = 5
+"""changes on either side that say what is usual"""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,15 @@ class Changes:
     @property
     def median(self) -> float:
         return statistics.median(self.each)
+
+    @property
+    def sudden(self) -> float:
+        """The largest excess of a change over the median of itself and the `AROUND` before and after, grey levels.
+
+        What grows slowly, as motion does, is not in it.
+        """
+        medians = (statistics.median(self.each[max(i - AROUND, 0) : i + AROUND + 1]) for i in range(len(self.each)))
+        return max(change - median for change, median in zip(self.each, medians, strict=True))
 
     @property
     def largest_by_median(self) -> float:

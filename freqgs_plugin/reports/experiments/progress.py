@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+@runtime_checkable
 class Progress(Protocol):
     """Shows tasks."""
 

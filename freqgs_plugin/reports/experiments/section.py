@@ -1,8 +1,8 @@
 """What a section of an experiment consists of."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from freqgs_plugin.reports.bench.tables import BenchTable
 from freqgs_plugin.reports.experiments.goals import Goal
@@ -17,20 +17,13 @@ Results = Sequence[dict[str, Any]]
 """what `measure` returned, one per seed; JSON values, so null for infinite numbers"""
 
 
-class Measure(Protocol):
-    def __call__(self, lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]: ...
-
-
-class Tables(Protocol):
-    def __call__(self, scene: str, results: Results) -> list[BenchTable]: ...
-
-
-class Figures(Protocol):
-    def __call__(self, scene: str, results: Results) -> "Mapping[str, Figure]": ...
-
-
-class Goals(Protocol):
-    def __call__(self, scene: str, results: Results) -> list[Goal]: ...
+Measure = Callable[[Lab, Trial, ClodOptions], dict[str, Any]]
+"""does what is not done yet, for one scene and seed"""
+Tables = Callable[[str, Results], list[BenchTable]]
+"""name of the scene, results of all seeds -> tables"""
+Figures = Callable[[str, Results], "Mapping[str, Figure]"]
+"""the same -> end of a file's name -> picture"""
+Goals = Callable[[str, Results], list[Goal]]
 
 
 def no_goals(scene: str, results: Results) -> list[Goal]:
@@ -48,5 +41,4 @@ class Part:
     measure: Measure
     tables: Tables
     figures: Figures
-    """end of the file's name -> picture"""
     goals: Goals = no_goals

@@ -9,6 +9,9 @@ from torch import Tensor
 from freqgs_plugin.functional.budget import DecayBudget, in_view
 from freqgs_plugin.types import Camera, Gaussians
 
+_LEAST_SCALE = 1e-6
+"""s_v has to go below 1 where sigma is so small that Gaussians are gone at full detail"""
+
 
 @dataclass(frozen=True)
 class MostOpaque:
@@ -46,5 +49,6 @@ class SharedDecay:
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
         shared = replace(gaussians, decay=torch.full_like(gaussians.opacities, self.decay))
-        weight = DecayBudget(self.count, scene_distance=self.scene_distance, soft=False)(shared, camera)
+        budget = DecayBudget(self.count, scene_distance=self.scene_distance, soft=False, least=_LEAST_SCALE)
+        weight = budget(shared, camera)
         return weight if self.fade else (weight > 0).to(weight.dtype)
