@@ -66,7 +66,7 @@ def render_prefixes(
 
     `attenuation` multiplies opacities. The last one's `info` describes all rows; see `PrefixRasterizer.prefixes` for
     what its `means2d` receives. Rows of weight 0 have radius 0 there: they count as not seen. `info["drawn"]` counts
-    the others.
+    the others. Prefixes of levels without Gaussians are composited once, with the prefix before them.
     """
     options = {"background": background, "antialiased": antialiased}
     weight = None if attenuation is None else attenuation(gaussians, camera)
@@ -129,6 +129,13 @@ def _composite_prefixes(
 ) -> list[Rendering]:
     if num_levels == 1:
         return [rasterizer(splats, camera, depth=False, **options)]
+    if statistics == "full":
+        # with "own", a picture that stands for two prefixes would feed the statistics twice
+        rank = _distinct_prefixes(level, num_levels)
+        if rank[-1] < num_levels:
+            among = level.new_tensor(rank)[level.long() - 1]
+            distinct = _composite_prefixes(splats, among, rank[-1], camera, rasterizer, statistics, options)
+            return [distinct[k - 1] for k in rank]
     if isinstance(rasterizer, PrefixRasterizer):
         return rasterizer.prefixes(splats, level, num_levels, camera, statistics=statistics, **options)
     renderings, rows_drawn = [], []
@@ -140,6 +147,20 @@ def _composite_prefixes(
     if statistics == "own" and renderings[-1].info["means2d"].requires_grad:
         renderings[-1] = _with_own_statistics(renderings, rows_drawn, level)
     return renderings
+
+
+def _distinct_prefixes(level: Int[Tensor, " n"], num_levels: int) -> list[int]:
+    """For each prefix its number among the distinct ones, from 1: a level without Gaussians adds nothing.
+
+    The first and the last prefix always count, whether or not their levels hold any. So do all where a level lies
+    outside of 1..num_levels, which the rasterizer refuses.
+    """
+    counts = torch.stack([(level == k).sum() for k in range(1, num_levels + 1)]).tolist()
+    rank = []
+    for k, count in enumerate(counts, start=1):
+        new = count > 0 or k in (1, num_levels) or sum(counts) < len(level)
+        rank.append((rank[-1] if rank else 0) + new)
+    return rank
 
 
 def _rows(splats: Splats, rows: Tensor) -> Splats:

@@ -152,3 +152,49 @@ def test_rendered_weights_fade_with_distance(rasterizer):
     assert bool((weight[~shown] == 0).all())
     expected = rendered_weight(g.select(shown), CAMERA, 1, decay, rasterizer=rasterizer)
     torch.testing.assert_close(weight[shown], expected, rtol=1e-3, atol=1e-4)
+
+
+class Counting:
+    """A rasterizer that counts the prefixes that it composites."""
+
+    name, absgrad = "counting", True
+
+    def __init__(self, inner):
+        self.inner, self.composited = inner, 0
+
+    def __call__(self, splats, camera, **options):
+        self.composited += 1
+        return self.inner(splats, camera, **options)
+
+
+class CountingPrefixes(Counting):
+    def prefixes(self, splats, level, num_levels, camera, **options):
+        self.composited += num_levels
+        return self.inner.prefixes(splats, level, num_levels, camera, **options)
+
+
+@pytest.mark.parametrize("levels, num_levels, composited", [((1, 3), 3, 2), ((1, 4), 5, 3), ((3,), 5, 3), ((2,), 3, 3)])
+@pytest.mark.parametrize("inner", [NumbaRasterizer, TorchRasterizer])
+def test_prefixes_of_empty_levels_cost_nothing_and_change_nothing(inner, levels, num_levels, composited, assert_close):
+    g = gaussians()
+    level = torch.tensor(levels, dtype=torch.int32)[torch.arange(len(g)) % len(levels)]
+    found = []
+    for statistics in ("full", "own"):
+        leaf = g.means.clone().requires_grad_()
+        counting = (CountingPrefixes if inner is NumbaRasterizer else Counting)(inner())
+        scene = replace(g, means=leaf, level=level)
+        pictures = render_prefixes(scene, CAMERA, num_levels, rasterizer=counting, statistics=statistics)
+        assert counting.composited == (composited if statistics == "full" else num_levels)
+        for k, picture in enumerate(pictures, start=1):
+            cut = render(scene, CAMERA, LevelCut(k), rasterizer=inner())
+            assert_close(picture.features.detach(), cut.features.detach(), loosen=0.1)
+        torch.stack([k * p.features.square().sum() for k, p in enumerate(pictures, start=1)]).sum().backward()
+        assert pictures[-1].info["radii"].shape == (1, len(g))
+        found.append(leaf.grad)
+    assert_close(found[0], found[1], loosen=100)
+
+
+def test_levels_outside_of_the_models_are_refused_beside_empty_ones():
+    g = replace(gaussians(), level=torch.full((40,), 4, dtype=torch.int32))
+    with pytest.raises(ValueError, match=r"outside of 1\.\.3"):
+        render_prefixes(g, CAMERA, 3, rasterizer=NumbaRasterizer())

@@ -43,6 +43,37 @@ def accuracy(load_config: Path | None = None, options: Options = BenchOptions())
     run_bench(accuracy_bench(options, trained), options, _console(), *arguments)
 
 
+def step(data: Path, steps: int = 1200, options: Options = BenchOptions()) -> None:  # noqa: B008
+    """Train lapsplat for a while, on the CPU, and tell which part of a step takes how long.
+
+    Args:
+        data: folder with a COLMAP model and its images, or with a transforms.json.
+        steps: length of the run; all step constants scale with it, so every stage comes.
+        options: where to write, and how to measure.
+    """
+    from freqgs_plugin.reports.bench.runner import run_bench
+    from freqgs_plugin.reports.bench.step import step_bench
+
+    arguments = ["--data", data.name, "--steps", str(steps)]
+    run_bench(step_bench(options, data, steps), options, _console(), *arguments)
+
+
+def savings(load_config: Path, options: Options = BenchOptions()) -> None:  # noqa: B008
+    """Measure what leaving out saves, each with and without: rows, bands, prefixes, transforms, gradients.
+
+    Args:
+        load_config: config.yml of a trained run.
+        options: where to write, and how to measure.
+    """
+    from freqgs_plugin.reports.bench.runner import run_bench
+    from freqgs_plugin.reports.bench.savings import savings_bench, subject_of
+    from freqgs_plugin.reports.bench.trained import load, views_of
+
+    run = load(load_config)
+    bench = savings_bench(options, subject_of(run, views_of(run)[0]))
+    run_bench(bench, options, _console(), "--load-config", "RUN/config.yml")
+
+
 def _console() -> Any:
     """Tables are not folded to the 80 columns that a file or a pipe would have."""
     from rich.console import Console
@@ -50,5 +81,5 @@ def _console() -> Any:
     return Console() if sys.stdout.isatty() else Console(width=200)
 
 
-BENCHES = {"raster": raster, "scaling": scaling, "accuracy": accuracy}
+BENCHES = {"raster": raster, "scaling": scaling, "accuracy": accuracy, "step": step, "savings": savings}
 """name on the command line -> function"""

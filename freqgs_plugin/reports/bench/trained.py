@@ -1,7 +1,9 @@
 """A trained run for a benchmark."""
 
 import io
-from contextlib import redirect_stderr, redirect_stdout
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +20,10 @@ def load(config_path: Path) -> Any:
     Raises:
         BenchError: there is no such run, or it is of another method.
     """
-    from freqgs_plugin.studio.checkpoint import load_run
-
     try:
-        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        with _quiet():
+            from freqgs_plugin.studio.checkpoint import load_run
+
             return load_run(config_path)
     except (FileNotFoundError, ValueError) as error:
         raise BenchError(str(error)) from error
@@ -29,7 +31,16 @@ def load(config_path: Path) -> Any:
 
 def views_of(run: Any) -> list[Any]:
     """The held-out views, or those trained on where none is held out."""
-    return run.cameras("test") or run.cameras("train")
+    with _quiet():
+        return run.cameras("test") or run.cameras("train")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """What nerfstudio has to say goes nowhere."""
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 @torch.no_grad()
