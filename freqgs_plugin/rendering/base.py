@@ -31,6 +31,9 @@ BLUR = 0.3
 RADIUS_SIGMAS = 3.0
 """`info["radii"]` is this many standard deviations of the longer axis, rounded up, px"""
 
+MAX_ENTRIES = 2**31 - 1
+"""entries in the lists of Gaussians per tile: more take tens of gigabytes"""
+
 Statistics = Literal["own", "full"]
 """which prefix feeds `info["means2d"].grad` and `.absgrad` of a prefix rendering:
 `own`: for a Gaussian of level k the rendering of prefix k; `full`: the rendering of all levels for everyone"""
@@ -131,8 +134,22 @@ def check_inputs(splats: Splats, camera: Camera) -> None:
             first = int(rows[0])
             raise ValueError(
                 f"{name} of {len(rows)} of {len(values)} Gaussians are not finite (first: row {first}, "
-                f"{values[first].tolist()}). Remove these Gaussians, or go back to a checkpoint before they appeared."
+                f"{values[first].tolist()}). Remove these Gaussians; in training, lower the learning rates, or go back "
+                "to a checkpoint before they appeared."
             )
+
+
+def check_entries(entries: int, gaussians: int, camera: Camera) -> None:
+    """Refuse lists of Gaussians per tile that would not fit into memory, before they are made.
+
+    Raises:
+        ValueError: there are more than `MAX_ENTRIES`.
+    """
+    if entries > MAX_ENTRIES:
+        raise ValueError(
+            f"{gaussians:,} Gaussians meet {entries:,} tiles of the {camera.width}x{camera.height} image, more than "
+            f"{MAX_ENTRIES:,}. Render a smaller image, or remove Gaussians that cover all of it."
+        )
 
 
 def _sum_dtype(values: Tensor) -> torch.dtype:

@@ -13,7 +13,7 @@ from numba import get_num_threads
 from torch import Tensor
 
 from freqgs_plugin.functional.numba_threads import check_layer
-from freqgs_plugin.rendering.base import BLUR, Statistics, check_inputs
+from freqgs_plugin.rendering.base import BLUR, Statistics, check_entries, check_inputs
 from freqgs_plugin.rendering.numba_binning import depth_order, tile_lists
 from freqgs_plugin.rendering.numba_compositing import composite, composite_backward
 from freqgs_plugin.rendering.numba_projection import COLUMNS, OPACITY, V_COLUMNS, project, project_backward
@@ -203,6 +203,7 @@ class NumbaRasterizer:
         )  # fmt: skip
         order = depth_order(depths.numpy(), projected.numpy())
         lists = tile_lists(order, projected.numpy(), camera.width, camera.height, n, get_num_threads())
+        check_entries(int(lists[0][-1]), len(order), camera)
         view = _View(
             pose, intrinsics, camera.width, camera.height, blur, antialiased, prefixes, own,
             None if level is None else _array(level), projected.numpy(), lists,

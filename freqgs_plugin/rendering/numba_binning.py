@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from freqgs_plugin.functional.numba_threads import njit, prange
-from freqgs_plugin.rendering.base import ALPHA_MIN
+from freqgs_plugin.rendering.base import ALPHA_MIN, MAX_ENTRIES
 from freqgs_plugin.rendering.numba_projection import OPACITY, REACH_X, REACH_Y, S, U, V, X, Y
 
 TILE = 16
@@ -72,7 +72,8 @@ def tile_lists(order, splats, width, height, num_rows, bands):
     Returns:
         offsets [tiles + 1] into the lists; ids [entries] Gaussian rows; boxes [entries]: first row, last row, first and
         last strip within the tile, 4 + 4 + 4 + 4 bits; slots [entries] where a Gaussian's entries are contiguous; first
-        and count [num_rows] of each Gaussian's slots.
+        and count [num_rows] of each Gaussian's slots. Where there would be more than MAX_ENTRIES, offsets [1] is
+        their number, and no list is made.
     """
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     n = order.shape[0]
@@ -116,6 +117,10 @@ def tile_lists(order, splats, width, height, num_rows, bands):
     for k in range(n):
         first[order[k]] = entries[k]
         count[order[k]] = entries[k + 1] - entries[k]
+
+    if entries[n] > MAX_ENTRIES:
+        none = np.empty(0, np.int64)
+        return entries[n:], np.empty(0, np.int32), np.empty(0, np.uint16), none, first, count
 
     # threads take bands of tile rows: each list is filled by one thread, in depth order
     bands = min(bands, tiles_y)

@@ -54,7 +54,7 @@ def _broadcast(builder: Any, number: Any) -> Any:
     return builder.shuffle_vector(vector, ir.Constant(_FLOATS, ir.Undefined), first)
 
 
-@lower_cast(types.float32, lanes_type)  # pyright: ignore[reportOptionalCall]
+@lower_cast(types.float32, lanes_type)
 def _(context, builder, source, target, value):  # pyright: ignore[reportUnusedParameter]
     return _broadcast(builder, value)
 
@@ -62,7 +62,7 @@ def _(context, builder, source, target, value):  # pyright: ignore[reportUnusedP
 def _elementwise(operation: Any, result: _Vector, build: Any) -> None:
     """Teach numba `operation` on two Lanes, or Lanes and a float32."""
 
-    @infer_global(operation)
+    @infer_global(operation)  # pyright: ignore[reportOptionalCall]
     class _Typing(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:
             if lanes_type in args and all(a in (lanes_type, types.float32) for a in args):

@@ -38,7 +38,7 @@ class TorchRasterizer:
         projected = project(splats.means, splats.quats, splats.scales, camera, blur)
         opacities = splats.opacities * projected.compensation if antialiased else splats.opacities
         info = strategy_info(projected, opacities, camera)
-        tiles = bin_splats(projected, opacities.detach(), camera.height, camera.width)
+        tiles = bin_splats(projected, opacities.detach(), camera)
         features, transmittance, depths = _Composite.apply(
             info["means2d"],
             projected.conics,

@@ -8,7 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from freqgs_plugin.functional.projection import Projected
-from freqgs_plugin.rendering.base import ALPHA_MIN
+from freqgs_plugin.rendering.base import ALPHA_MIN, check_entries
+from freqgs_plugin.types import Camera
 
 TILE = 8
 """side of a tile, px"""
@@ -56,13 +57,13 @@ def chunks_by_length(lengths: Int[Tensor, " t"], size: int) -> Iterator[Int[Tens
 
 
 @torch.no_grad()
-def bin_splats(projected: Projected, opacities: Float[Tensor, " n"], height: int, width: int) -> Tiles:
+def bin_splats(projected: Projected, opacities: Float[Tensor, " n"], camera: Camera) -> Tiles:
     """List, for every tile, the Gaussians with a pixel centre where alpha >= 1/255.
 
     That is the ellipse `d^T conic d <= L` with `L = 2 ln(255 opacity)`. Its span is exact for every row of tiles: first
     the (Gaussian, row of tiles) pairs are listed, then the tiles that each pair spans.
     """
-    across, down = -(-width // TILE), -(-height // TILE)
+    across, down = -(-camera.width // TILE), -(-camera.height // TILE)
     candidates = torch.nonzero(projected.visible & (opacities >= ALPHA_MIN)).squeeze(1)
     candidates = candidates[torch.argsort(projected.depths[candidates], stable=True)]
     reach = 2 * torch.log(opacities[candidates] / ALPHA_MIN)
@@ -70,7 +71,9 @@ def bin_splats(projected: Projected, opacities: Float[Tensor, " n"], height: int
     first, last = _tile_range(y - ry, y + ry, down)
     pair, tile_y = _expand(first, last)
     left, right = _row_span(projected, candidates, reach, pair, tile_y)
-    entry, tile_x = _expand(*_tile_range(left, right, across))
+    first, last = _tile_range(left, right, across)
+    check_entries(int((last - first + 1).sum()), len(candidates), camera)
+    entry, tile_x = _expand(first, last)
     tiles = across * down
     tile = (tile_y[entry] * across + tile_x).to(torch.int16 if tiles < 2**15 else torch.int32)
     tile, order = torch.sort(tile, stable=True)

@@ -96,6 +96,16 @@ def test_impossible_cameras_are_refused(backend, change, message):
         get_rasterizer(backend, "cpu")(splats, replace(camera, **change))
 
 
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_lists_that_would_not_fit_into_memory_are_refused(backend, monkeypatch):
+    monkeypatch.setattr(base, "MAX_ENTRIES", 40)
+    splats, camera = scenes.splats(dtype=torch.float32), scenes.camera(dtype=torch.float32)
+    with pytest.raises(
+        ValueError, match=r"40 Gaussians meet \d+ tiles of the 37x29 image, more than 40. Render a smaller"
+    ):
+        get_rasterizer(backend, "cpu")(splats, camera)
+
+
 @pytest.mark.parametrize("name", ["quats", "scales", "opacities", "features"])
 def test_tensors_of_several_dtypes_are_refused(name):
     splats = scenes.splats(dtype=torch.float32)

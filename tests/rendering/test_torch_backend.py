@@ -128,7 +128,7 @@ def test_no_pixel_of_a_footprint_is_missed():
 def test_tiles_hold_no_gaussian_that_misses_them():
     splats, camera = scenes.splats(200, seed=12), scenes.camera(64, 48)
     projected = project(splats.means, splats.quats, splats.scales, camera, 0.3)
-    tiles = bin_splats(projected, splats.opacities, 48, 64)
+    tiles = bin_splats(projected, splats.opacities, camera)
     tile = torch.repeat_interleave(torch.arange(tiles.counts.shape[0]), tiles.counts)
     offsets = (torch.arange(8) - 3.5).double()
     y, x = (c.reshape(-1) for c in torch.meshgrid(offsets, offsets, indexing="ij"))

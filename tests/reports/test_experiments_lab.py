@@ -96,7 +96,6 @@ def test_a_run_whose_folder_is_gone_is_trained_again_only_where_it_is_needed(tmp
     lab, _ = fake_lab(tmp_path)
     assert lab.step("curve", [TRIAL.clod()], {}, lambda: len(lab.run(TRIAL.clod()).gaussians)) == 60
     lab.config_path(TRIAL.clod()).unlink()
-    lab.config_path  # noqa: B018
     again, tools = fake_lab(tmp_path)
     assert again.step("curve", [TRIAL.clod()], {}, lambda: 1 / 0) == 60 and tools.trained == []
 

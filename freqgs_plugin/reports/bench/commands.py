@@ -54,7 +54,7 @@ def step(data: Path, steps: int = 1200, options: Options = BenchOptions()) -> No
     from freqgs_plugin.reports.bench.runner import run_bench
     from freqgs_plugin.reports.bench.step import step_bench
 
-    arguments = ["--data", data.name, "--steps", str(steps)]
+    arguments = ["--data", data.resolve().name, "--steps", str(steps)]
     run_bench(step_bench(options, data, steps), options, _console(), *arguments)
 
 

@@ -1,6 +1,5 @@
 """Does the steps of an experiment, one at a time, and none of them twice."""
 
-import os
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -73,18 +72,19 @@ class Lab:
         settings = self._settings(training)
         of = key(settings)
         record = self.store.read("train", settings)
-        if record is not None and (self.store.folder / record["result"]["config"]).is_file():
+        if record is not None and Path(record["result"]["config"]).is_file():
             self.used[str(self.store.path("train", settings))] = record
-            return self.store.folder / record["result"]["config"]
+            return Path(record["result"]["config"])
         self.store.path("train", settings).unlink(missing_ok=True)
 
         def train() -> dict[str, str]:
             title = f"{training.scene.name}: training {training.method}, {_changes(training)}"
             with self.progress.task(title, training.steps) as on_step:
                 path = self.tools.train(training, of, on_step)
-            return {"config": _relative(path, self.store.folder)}
+            # whole, as in config.yml itself: nerfstudio finds no checkpoint in a folder that was moved
+            return {"config": str(path.resolve())}
 
-        return self.store.folder / self._done("train", settings, train)["result"]["config"]
+        return Path(self._done("train", settings, train)["result"]["config"])
 
     def run(self, training: Training) -> Any:
         """The trained run, loaded."""
@@ -124,8 +124,3 @@ class Lab:
 def _changes(training: Training) -> str:
     named = [f"{name} {value}" for name, value in training.options.items()]
     return ", ".join([*(named if len(named) < 5 else named[:1]), f"seed {training.seed}"])
-
-
-def _relative(path: Path, folder: Path) -> str:
-    """A path that stays right when the whole output folder moves."""
-    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()

@@ -134,3 +134,5 @@ class Row:
     milliseconds: float | None
     """forward and backward"""
     passed: bool
+    note: str = ""
+    """what else there is to say; `rmse`, loss and guard of a training run"""

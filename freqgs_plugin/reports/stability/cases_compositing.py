@@ -112,5 +112,6 @@ def _stacks() -> list[Case]:
             lambda: _stack(torch.full((LAYERS,), 0.01), camera()),
             Value(gradient=2e-3),
             large=True,
+            by_hand=False,
         ),
     ]

@@ -74,6 +74,7 @@ def _anisotropy() -> list[Case]:
             Value(value=1e-4, gradient=1e-3),
             antialiased=False,
             shift=1e-3,
+            large=length != 10.0,
         )
         for length, ratio in ((1.0, 1e3), (10.0, 1e3), (1e3, 1e8))
     ]
@@ -187,7 +188,13 @@ def _counts() -> list[Case]:
     return [
         case("no Gaussians", lambda: (splats(0), camera()), Nothing()),
         case("one Gaussian", lambda: (single(), camera())),
-        case("a million Gaussians", million, Value(value=1e-2, gradient=1e-2), large=True),
+        case(
+            "more than 2^31 entries of tiles",
+            lambda: (changed(splats(8300), scales=1e6), camera(8192, 8192, focal=8192.0)),
+            Refused(ValueError, r"8,300 Gaussians meet [\d,]+ tiles of the 8192x8192 image, more than 2,147,483,647"),
+            large=True,
+        ),
+        case("a million Gaussians", million, Value(value=1e-2, gradient=1e-2), large=True, by_hand=False),
     ]
 
 

@@ -23,9 +23,6 @@ from freqgs_plugin.rendering.base import (
 )
 from freqgs_plugin.types import Camera, Splats
 
-LIMIT = 6_000_000
-"""Gaussians times pixels that are still small"""
-
 
 @dataclass(frozen=True)
 class _Flat:

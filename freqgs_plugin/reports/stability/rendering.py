@@ -10,7 +10,7 @@ from torch import Tensor
 
 from freqgs_plugin.rendering.base import BLUR, get_rasterizer
 from freqgs_plugin.reports.stability.case import Case, Compute, Group, Nothing, Refused, Setting, Tensors, Value
-from freqgs_plugin.reports.stability.dense import LIMIT, dense
+from freqgs_plugin.reports.stability.dense import dense
 from freqgs_plugin.types import Camera, Splats
 
 SETTINGS = (
@@ -102,11 +102,12 @@ def rendering_case(
     blur: float = BLUR,
     shift: float = 0.0,
     large: bool = False,
-    settings: tuple[Setting, ...] = SETTINGS,
+    by_hand: bool = True,
 ) -> Case:
     """The picture of a scene on a coloured background, with all its gradients.
 
     `shift`: relative distance from a threshold (alpha, transmittance, near plane) within which both sides are right.
+    `by_hand`: the truth is `dense`, not torch in float64; for up to some millions of Gaussians times pixels.
     """
 
     def inputs() -> Tensors:
@@ -138,16 +139,14 @@ def rendering_case(
             for side in ((0.0, -shift, shift) if shift else (0.0,))
         ]
 
-    gaussians, view = scene() if not large else (None, None)
-    small = gaussians is not None and view is not None and len(gaussians) * view.width * view.height <= LIMIT
     return Case(
         group=group,
         name=name,
         inputs=inputs,
         compute=compute,
-        truth=exact if small else None,
+        truth=exact if by_hand else None,
         expected=expected,
-        settings=settings,
+        settings=SETTINGS,
         units=_natural_units,
         fixed=frozenset({"viewmat", "K"}),
         large=large,

@@ -9,7 +9,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from freqgs_plugin.reports.stability.case import Case, Group, Refused, Row
+import torch
+
+from freqgs_plugin.reports.stability.case import Case, Group, Refused, Row, Setting
+from freqgs_plugin.reports.stability.cases_training import TrainingCase, run_training
 from freqgs_plugin.reports.stability.measure import Evaluated, measure, truths
 from freqgs_plugin.reports.stability.suite import GROUPS, cases_of
 from freqgs_plugin.reports.stability.tables import markdown_page, rich_table
@@ -70,9 +73,10 @@ def _run_group(group: Group, quick: bool, rows_path: Path, console: "Console") -
     with Progress(*columns, console=console) as bar, rows_path.open("a", encoding="utf-8") as file:
         cases = cases_of(group, quick)
         task = bar.add_task(group, total=len(cases))
+        outcomes = _outcomes(cases)
         for case in cases:
             bar.update(task, description=case.id)
-            for row in _run_case(case):
+            for row in next(outcomes):
                 rows.append(row)
                 file.write(json.dumps(finite_json(asdict(row))) + "\n")
             file.flush()
@@ -81,10 +85,17 @@ def _run_group(group: Group, quick: bool, rows_path: Path, console: "Console") -
     return rows, time.perf_counter() - start
 
 
-def _run_case(case: Case) -> Iterator[Row]:
+def _outcomes(cases: Sequence[Case | TrainingCase]) -> Iterator[list[Row]]:
+    """The rows of each case. Training runs share a child process, and run with what `auto` would choose."""
+    training = [case for case in cases if isinstance(case, TrainingCase)]
+    runs = run_training(training, Setting("gsplat" if torch.cuda.is_available() else "numba", torch.float32))
+    for case in cases:
+        yield [next(runs)] if isinstance(case, TrainingCase) else _run_case(case)
+
+
+def _run_case(case: Case) -> list[Row]:
     answers: Sequence[Evaluated] = [] if isinstance(case.expected, Refused) else truths(case)
-    for setting in case.settings:
-        yield measure(case, setting, answers, repeats=1 if case.large else 3)
+    return [measure(case, setting, answers, repeats=1 if case.large else 3) for setting in case.settings]
 
 
 @contextmanager
