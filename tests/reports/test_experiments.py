@@ -19,7 +19,7 @@ from freqgs_plugin.functional.attenuation import DistanceDecay
 from freqgs_plugin.functional.budget import decay_scale, in_view
 from freqgs_plugin.functional.similarity import Similarity
 from freqgs_plugin.reports.drawing import draw
-from freqgs_plugin.reports.experiments import ablation, budget, curve, dolly, pops, sigma
+from freqgs_plugin.reports.experiments import ablation, budget, curve, dolly, jumps, pops, sigma
 from freqgs_plugin.reports.experiments.goals import Goal, goal_markdown, goal_table, summary
 from freqgs_plugin.reports.experiments.measures import Changes, at_scale, changes, neighbours, quality
 from freqgs_plugin.reports.experiments.options import SECTIONS, ClodOptions, ExperimentError, command_line
@@ -269,27 +269,27 @@ def test_jumps_of_a_sweep_a_dolly_and_a_switch(view):
     run, fine, coarse = decaying_run(1.0), decaying_run(None, n=60), decaying_run(None, n=20)
     cameras = dolly.made_from(run, view.camera, 7)
     seen = []
-    found = pops.jumps(run, [fine, coarse], view, cameras, 6, seen.append)
+    found = jumps.jumps(run, [fine, coarse], view, cameras, 6, seen.append)
     paths = found["paths"]
-    assert set(paths) == set(pops.PATHS) and seen[-1] == 3 * 6 + 3
-    switch = paths["sweep"][pops.SWITCH]
+    assert set(paths) == set(jumps.PATHS) and seen == [1, 2, 3, 4, 5, 6]
+    switch = paths["sweep"][jumps.SWITCH]
     assert [i for i, change in enumerate(switch["each"]) if change > 0] == [2], "one jump, in the middle"
     assert switch["median"] == 0 and switch["largest_by_median"] == math.inf
     assert as_json(switch)["largest_by_median"] is None
-    assert [i for i, c in enumerate(paths["fading"][pops.SWITCH]["each"]) if c > 0] == [2]
-    assert all(c > 0 for c in paths["dolly"][pops.CAMERA]["each"]), "the camera moves"
-    for path in pops.PATHS:
-        for name in pops.variants(run):
+    assert [i for i, c in enumerate(paths["fading"][jumps.SWITCH]["each"]) if c > 0] == [2]
+    assert all(c > 0 for c in paths["dolly"][jumps.CAMERA]["each"]), "the camera moves"
+    for path in jumps.PATHS:
+        for name in jumps.variants(run):
             assert len(paths[path][name]["each"]) == 6, (path, name)
-    assert len(found["psnr"][pops.DEFAULT]) == 7 and found["scales"][0] == 1 and found["scales"][-1] == 5
+    assert len(found["psnr"][jumps.DEFAULT]) == 7 and found["scales"][0] == 1 and found["scales"][-1] == 5
     expected = psnr(draw(run, view.camera, at_scale(run, 1.0)).features.clamp(0, 1), view.image)
-    assert found["psnr"][pops.DEFAULT][0] == pytest.approx(expected)
+    assert found["psnr"][jumps.DEFAULT][0] == pytest.approx(expected)
 
 
 def test_fading_alone_has_no_motion(view):
     run = decaying_run(1e6)
     cameras = dolly.made_from(run, view.camera, 4)
-    pairs = pops.fading_alone(run, cameras, at_scale(run, 1.0))
+    pairs = jumps.fading_alone(run, cameras, at_scale(run, 1.0))
     assert changes(pairs).largest == pytest.approx(0, abs=1e-3), "nothing fades at all"
     moving = changes(neighbours(draw(run, camera, at_scale(run, 1.0)).features for camera in cameras))
     assert moving.largest > 1

@@ -5,7 +5,6 @@ import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -118,8 +117,3 @@ def neighbours(
         if before is not None:
             yield before, frame
         before = frame
-
-
-def device_of(run: TrainedRun) -> torch.device:
-    """Where the run's Gaussians are."""
-    return run.gaussians.means.device

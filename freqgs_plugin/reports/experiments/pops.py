@@ -2,46 +2,29 @@
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
-from freqgs_plugin.functional.attenuation import Attenuation, DistanceDecay, Reference
 from freqgs_plugin.io.init_source import TRANSFORMS, read_frame
 from freqgs_plugin.reports.bench.tables import BenchTable, Row
-from freqgs_plugin.reports.drawing import HeldOutView, TrainedRun, draw
+from freqgs_plugin.reports.drawing import HeldOutView
 from freqgs_plugin.reports.experiments import dolly
 from freqgs_plugin.reports.experiments.goals import Goal
+from freqgs_plugin.reports.experiments.jumps import CAMERA, DEFAULT, HELD_SCALE, PATHS, SWITCH, jumps, variants
 from freqgs_plugin.reports.experiments.lab import Lab, LoadedRun
-from freqgs_plugin.reports.experiments.measures import Changes, at_scale, changes, neighbours
+from freqgs_plugin.reports.experiments.measures import at_scale
 from freqgs_plugin.reports.experiments.options import ClodOptions
 from freqgs_plugin.reports.experiments.plots import COLOURS, GREY, panels
 from freqgs_plugin.reports.experiments.section import Part, Results
 from freqgs_plugin.reports.experiments.seeds import mean, shown
 from freqgs_plugin.reports.experiments.training import DEFAULT_SCALE, Trial
-from freqgs_plugin.reports.tables import psnr
-from freqgs_plugin.types import Camera, Gaussians
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-REFERENCES: tuple[Reference, ...] = ("scene", "frustum_max", "frustum_quantile")
-DEFAULT = "soft, scene"
-SWITCH = "two models, switched halfway"
-CAMERA = "nothing fades"
-HELD_SCALE = (1 + DEFAULT_SCALE) / 2
-"""s_v along the dolly"""
 BY_MEDIAN, BY_SWITCH = 3.0, 0.1
 """the largest change may be so many times the median one, and this part of the switch's"""
-PATHS = {
-    "sweep": f"s_v from 1 to {DEFAULT_SCALE:g}, fixed camera",
-    "dolly": f"dolly at s_v {HELD_SCALE:g}",
-    "fading": f"dolly at s_v {HELD_SCALE:g}, fading alone",
-}
-
 INTRODUCTION = f"""\
 Neighbouring frames, compared: the mean absolute difference over pixels and colours, in grey levels of 255. *Sudden* is
 the largest excess of a change over the median of the eleven around it, *worst pixel* the largest change of any pixel.
@@ -55,16 +38,6 @@ many Gaussians as clodsplat draws at s_v = {DEFAULT_SCALE:g}.
   and what it looks at. The camera's own motion changes every frame: *{CAMERA}* shows how much.
 * *fading alone*: each frame of the dolly against the same frame with the weights of the frame before, so without the
   camera's motion."""
-
-
-@dataclass(frozen=True)
-class Given:
-    """Weights that are known already."""
-
-    weight: Tensor
-
-    def __call__(self, gaussians: Gaussians, camera: Camera) -> Tensor:
-        return self.weight
 
 
 def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
@@ -82,8 +55,7 @@ def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
         else:
             frame = read_frame(lab.config_path(clod).parent / TRANSFORMS)
             cameras = [dolly.in_frame(camera, frame, run.background.device) for camera in trial.scene.dolly]
-        total = 3 * len(variants(run)) + 3
-        with lab.progress.task(f"{trial.scene.name}: frames", total) as advance:
+        with lab.progress.task(f"{trial.scene.name}: frames", len(variants(run))) as advance:
             return jumps(run, models, view, cameras, options.frames, advance)
 
     more = {"frames": options.frames, "scale": HELD_SCALE, "coarse": "as many as are drawn at s_max"}
@@ -92,102 +64,6 @@ def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
 
 def _drawn(run: LoadedRun, view: HeldOutView, scale: float) -> int:
     return int((at_scale(run, scale)(run.gaussians, view.camera) > 0).sum())
-
-
-def variants(run: LoadedRun) -> dict[str, Callable[[float], DistanceDecay]]:
-    """Name -> attenuation at a scale, for both cuts and all references."""
-    distance = at_scale(run, 1.0).scene_distance
-    return {
-        f"{'soft' if soft else 'hard'}, {reference}": lambda s, soft=soft, reference=reference: DistanceDecay(
-            s, reference, distance if reference == "scene" else None, soft
-        )
-        for soft in (True, False)
-        for reference in REFERENCES
-    }
-
-
-def jumps(
-    run: LoadedRun,
-    models: Sequence[TrainedRun],
-    view: HeldOutView,
-    cameras: Sequence[Camera],
-    steps: int,
-    advance: Callable[[int], object] = lambda done: None,
-) -> dict[str, Any]:
-    """Path -> variant -> changes; PSNR along the sweep; `models` are the finer and the coarser one."""
-    scales = torch.linspace(1, DEFAULT_SCALE, steps + 1).tolist()
-    target = view.image.to(run.background)
-    found: dict[str, Any] = {path: {} for path in PATHS}
-    curves: dict[str, list[float]] = {}
-    done = 0
-    for name, at in variants(run).items():
-        found["sweep"][name], curves[name] = _sweep((_shown(run, view.camera, at(scale)) for scale in scales), target)
-        found["dolly"][name] = _record(changes(neighbours(_shown(run, camera, at(HELD_SCALE)) for camera in cameras)))
-        found["fading"][name] = _record(changes(fading_alone(run, cameras, at(HELD_SCALE))))
-        done += 3
-        advance(done)
-    fixed = [_shown(model, view.camera) for model in models]
-    found["sweep"][SWITCH], curves[SWITCH] = _sweep((fixed[_model(i, len(scales))] for i in range(len(scales))), target)
-    which = [models[_model(i, len(cameras))] for i in range(len(cameras))]
-    frames = (_shown(model, camera) for model, camera in zip(which, cameras, strict=True))
-    found["dolly"][SWITCH] = _record(changes(neighbours(frames)))
-    found["dolly"][CAMERA] = _record(changes(neighbours(_shown(run, camera) for camera in cameras)))
-    alone = (
-        (_shown(before, camera), _shown(after, camera)) if before is not after else _still(camera)
-        for before, after, camera in zip(which, which[1:], cameras[1:], strict=False)
-    )
-    found["fading"][SWITCH] = _record(changes(alone))
-    advance(done + 3)
-    return {
-        "paths": found,
-        "psnr": curves,
-        "scales": scales,
-        "gaussians": {"clodsplat": len(run.gaussians), "models": [len(model.gaussians) for model in models]},
-    }
-
-
-def fading_alone(
-    run: TrainedRun, cameras: Sequence[Camera], attenuation: Attenuation
-) -> Iterable[tuple[Tensor, Tensor]]:
-    """Each frame with the weights of the frame before, and with its own."""
-    weights = [attenuation(run.gaussians, camera) for camera in cameras[:1]]
-    for camera in cameras[1:]:
-        weights = [weights[-1], attenuation(run.gaussians, camera)]
-        before, after = (_shown(run, camera, Given(weight)) for weight in weights)
-        yield before, after
-
-
-def _model(frame: int, count: int) -> int:
-    """0 in the first half of the frames, 1 in the second."""
-    return int(frame >= count // 2)
-
-
-def _still(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Two frames without a difference."""
-    nothing = camera.K.new_zeros(camera.height, camera.width, 3)
-    return nothing, nothing
-
-
-@torch.no_grad()
-def _shown(run: TrainedRun, camera: Camera, attenuation: Attenuation | None = None) -> Tensor:
-    return draw(run, camera, attenuation).features.clamp(0, 1)
-
-
-def _sweep(frames: Iterable[Tensor], target: Tensor) -> tuple[dict[str, Any], list[float]]:
-    """Changes, and PSNR of every frame."""
-    curve: list[float] = []
-
-    def noted() -> Iterable[Tensor]:
-        for frame in frames:
-            curve.append(psnr(frame, target))
-            yield frame
-
-    return _record(changes(neighbours(noted()))), curve
-
-
-def _record(found: Changes) -> dict[str, Any]:
-    names = ("largest", "mean", "median", "largest_by_median", "sudden")
-    return {**asdict(found), **{name: getattr(found, name) for name in names}}
 
 
 def tables(scene: str, results: Results) -> list[BenchTable]:
@@ -260,7 +136,7 @@ def figures(scene: str, results: Results) -> "dict[str, Figure]":
     """Changes and PSNR along the paths, of the first seed."""
     result = results[0]
     figure, axes = panels(2, 2)
-    lines = {DEFAULT: (COLOURS[0], "-"), "hard, scene": (COLOURS[1], "-"), "soft, frustum_max": (COLOURS[2], "-")}
+    lines = {DEFAULT: (COLOURS[0], "-"), "hard, scene": (COLOURS[1], "--"), "soft, frustum_max": (COLOURS[2], "-")}
     lines |= {SWITCH: ("#000000", "--"), CAMERA: (GREY, ":")}
     for name, (colour, style) in lines.items():
         if name in result["psnr"]:
