@@ -15,7 +15,8 @@ from fake_run import fake_run, fake_views
 from freqgs_plugin import cli
 from freqgs_plugin.reports.bench import trained
 from freqgs_plugin.reports.bench.options import BenchError, BenchOptions
-from freqgs_plugin.reports.bench.savings import Saving, saving_row, saving_table, savings_of, subject_of
+from freqgs_plugin.reports.bench.savings import saving_row, saving_table
+from freqgs_plugin.reports.bench.savings_cases import Saving, savings_of, subject_of
 
 
 def subject(levels=3, decay=False):

@@ -66,7 +66,8 @@ def savings(load_config: Path, options: Options = BenchOptions()) -> None:  # no
         options: where to write, and how to measure.
     """
     from freqgs_plugin.reports.bench.runner import run_bench
-    from freqgs_plugin.reports.bench.savings import savings_bench, subject_of
+    from freqgs_plugin.reports.bench.savings import savings_bench
+    from freqgs_plugin.reports.bench.savings_cases import subject_of
     from freqgs_plugin.reports.bench.trained import load, views_of
 
     run = load(load_config)
