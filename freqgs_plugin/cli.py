@@ -49,7 +49,7 @@ def demo(
 
 def stability(
     output_dir: Path = Path("stability-out"),
-    only: Literal["geometry", "compositing", "decay", "losses", "autocast"] | None = None,
+    only: Literal["geometry", "compositing", "decay", "losses", "autocast", "training"] | None = None,
     quick: bool = False,
 ) -> None:
     """Run a grid of extremes through every backend and dtype: value and gradient errors, finite or not, time.

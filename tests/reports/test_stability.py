@@ -193,3 +193,13 @@ def test_cells_name_what_went_wrong():
     refused = measure(doubled(error=ValueError("a | b"), expected=Refused(ValueError, "a")), SINGLE)
     assert cell(refused) == "ValueError"
     assert cell(replace(refused, passed=False)) == "**wrong**: ValueError: a / b"
+
+
+def test_a_group_that_quick_leaves_out_is_said_and_stays(few, tmp_path):
+    runner.run_stability(tmp_path, None, False, console())
+    before = json.loads((tmp_path / runner.JSON).read_text())["groups"]
+    few["compositing"].clear()
+    said = console()
+    runner.run_stability(tmp_path, "compositing", True, said)
+    assert "Left out, as all of it takes long: compositing" in said.export_text()
+    assert json.loads((tmp_path / runner.JSON).read_text())["groups"] == before

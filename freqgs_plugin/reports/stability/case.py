@@ -13,6 +13,10 @@ Compute = Callable[[Tensors], Tensors]
 """differentiable: named inputs -> named outputs, in the dtype and on the device of the inputs"""
 
 
+class StabilityError(RuntimeError):
+    """A report that could not be made, or some cases did not come out right; the message names them."""
+
+
 @dataclass(frozen=True)
 class Setting:
     """What computes: a backend in a dtype."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from freqgs_plugin.reports.stability.case import Group, Row, Setting
+from freqgs_plugin.reports.stability.case import Group, Row, Setting, StabilityError
 
 STEPS = 400
 EVENT = 120
@@ -30,7 +30,7 @@ PATIENCE = 20
 """seconds for a stopped child to end by itself"""
 
 
-class RehearsalError(RuntimeError):
+class RehearsalError(StabilityError):
     """The child process failed; the message holds the end of its output."""
 
 
