@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 BACKENDS = ("numba", "torch")
 LIMIT = 20.0
 """a call that would take longer is left out, seconds"""
-PATIENCE = 20.0
+PATIENCE = 40.0
 """for the rounds of one size, seconds; there are at least two"""
 SIZE = (0.005, 0.04)
 """standard deviations, world units"""
