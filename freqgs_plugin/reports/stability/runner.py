@@ -61,8 +61,9 @@ def save_group(output_dir: Path, group: Group, record: dict[str, Any]) -> None:
     groups = json.loads(path.read_text(encoding="utf-8"))["groups"] if path.is_file() else {}
     groups[group] = finite_json(record)
     groups = {name: groups[name] for name in GROUPS if name in groups}
-    _replace(path, json.dumps({"groups": groups}, indent=1, allow_nan=False) + "\n")
-    _replace(output_dir / PAGE, markdown_page(groups))
+    text, page = json.dumps({"groups": groups}, indent=1, allow_nan=False) + "\n", markdown_page(groups)
+    _replace(path, text)
+    _replace(output_dir / PAGE, page)
 
 
 def _run_group(

@@ -57,7 +57,7 @@ def markdown_page(groups: Mapping[str, Any]) -> str:
     """docs/stability.md, from the groups of the JSON file."""
     parts = [INTRODUCTION]
     for name, record in groups.items():
-        rows = [Row(**{f.name: row[f.name] for f in fields(Row)}) for row in record["rows"]]
+        rows = [Row(**{f.name: row[f.name] for f in fields(Row) if f.name in row}) for row in record["rows"]]
         failed = sum(not row.passed for row in rows)
         hardware, settings = record["hardware"], _settings(rows)
         lines = [
