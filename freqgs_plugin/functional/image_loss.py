@@ -1,4 +1,4 @@
-"""The spatial image term (Eq. 11): L1 and SSIM, with a compiled SSIM on CPU, and the clamping before it.
+"""The spatial image term (Eq. 11): L1 and SSIM, compiled on CPU, and the clamping before it.
 
 SSIM here is pytorch_msssim's, which splatfacto trains with: values in [0, 1], an 11x11 Gaussian window of standard
 deviation 1.5 px, only windows that lie inside the image, K = (0.01, 0.03), mean over everything. kornia's loss is
@@ -45,13 +45,13 @@ def image_distance(
 
     Masked pixels: multiply both images by the mask first.
     """
-    terms = []
-    if ssim_weight != 1:
-        # row by row: the sum over everything would have other last bits with another number of threads
-        terms.append((1 - ssim_weight) * (pred - target).abs().mean(-1).mean())
-    if ssim_weight != 0:
-        terms.append(ssim_weight * (1 - ssim(pred, target)))
-    return torch.stack(terms).sum()
+    if ssim_weight == 0:
+        return _mean_distance(pred, target)
+    pred, target = _comparable(pred, target)
+    if not _has_kernels(pred, target):
+        return (1 - ssim_weight) * _mean_distance(pred, target) + ssim_weight * (1 - _ssim_by_convolution(pred, target))
+    by_l1 = (1 - ssim_weight) / pred.numel()
+    return ssim_weight + _compiled_sums(pred, target, -ssim_weight / _windows(pred), by_l1)
 
 
 def ssim(pred: Float[Tensor, "b c h w"], target: Float[Tensor, "b c h w"]) -> Float[Tensor, ""]:
@@ -60,16 +60,42 @@ def ssim(pred: Float[Tensor, "b c h w"], target: Float[Tensor, "b c h w"]) -> Fl
     Equals pytorch_msssim's `ssim(data_range=1)` where both sides have 11 px or more. A shorter side shrinks the window
     along that axis to the largest odd size that fits, renormalised to sum 1; with one tap on both axes SSIM compares
     single colours.
-    On CPU compiled loops compute value and gradient together, about 8 times as fast as convolutions with autograd.
+    On CPU compiled loops compute value and gradient together, many times as fast as convolutions with autograd.
     """
+    pred, target = _comparable(pred, target)
+    if not _has_kernels(pred, target):
+        return _ssim_by_convolution(pred, target)
+    return _compiled_sums(pred, target, 1 / _windows(pred), 0.0)
+
+
+def _mean_distance(pred: Tensor, target: Tensor) -> Tensor:
+    # row by row: the sum over everything would have other last bits with another number of threads
+    return (pred - target).abs().mean(-1).mean()
+
+
+def _comparable(pred: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Both in the same precision, at least float32; the one with a gradient first, as both measures are symmetric."""
     if pred.shape != target.shape:
         raise ValueError(f"SSIM needs images of one size, got {tuple(pred.shape)} and {tuple(target.shape)}.")
     dtype = torch.float64 if pred.dtype == torch.float64 else torch.float32
     pred, target = pred.to(dtype), target.to(dtype)
-    if target.requires_grad and not pred.requires_grad:
-        pred, target = target, pred
-    if pred.device.type != "cpu" or target.requires_grad:
-        return _ssim_by_convolution(pred, target)
+    return (target, pred) if target.requires_grad and not pred.requires_grad else (pred, target)
+
+
+def _has_kernels(pred: Tensor, target: Tensor) -> bool:
+    return pred.device.type == "cpu" and not target.requires_grad
+
+
+def _windows(image: Tensor) -> int:
+    """How many windows SSIM is the mean over."""
+    height, width = image.shape[-2:]
+    return image.shape[:-2].numel() * (height - _window(height).size + 1) * (width - _window(width).size + 1)
+
+
+def _compiled_sums(pred: Tensor, target: Tensor, by_ssim: float, by_l1: float) -> Tensor:
+    """`by_ssim` times the sum of SSIM over all windows and `by_l1` times that of |pred - target|, by compiled loops."""
+    from freqgs_plugin.functional.compiled_image_loss import CompiledImageSums
+
     centres = torch.stack([_plane_means(image) for image in (pred, target)]).view(2, -1)
     height, width = pred.shape[-2:]
     rows, columns = _window(height), _window(width)
@@ -79,9 +105,7 @@ def ssim(pred: Float[Tensor, "b c h w"], target: Float[Tensor, "b c h w"]) -> Fl
         pred, target = F.pad(pred, edge), F.pad(target, edge)
     pred, target = pred.flatten(0, 1).contiguous(), target.flatten(0, 1).contiguous()
     padded = [np.pad(taps, (TAPS - taps.size) // 2) for taps in (rows, columns)]
-    from freqgs_plugin.functional.compiled_ssim import CompiledSSIM
-
-    return CompiledSSIM.apply(pred, target, *padded, centres)
+    return CompiledImageSums.apply(pred, target, *padded, centres, by_ssim, by_l1)
 
 
 def _plane_means(image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c 1 1"]:
@@ -110,10 +134,10 @@ def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:
     rows, columns = (torch.as_tensor(_window(side), dtype=x.dtype, device=x.device) for side in (height, width))
     # variances are differences of blurred squares: half precision would leave nothing of them
     with torch.autocast(x.device.type, enabled=False):
-        maps = filter2d_separable(torch.cat([x, y, x * x, y * y, x * y]), columns[None], rows[None], padding="valid")
-    mean_x, mean_y, mean_xx, mean_yy, mean_xy = maps.chunk(5)
-    # rounding must not make a variance negative, or the denominator could vanish
-    variances = (mean_xx - mean_x**2).clamp_min(0) + (mean_yy - mean_y**2).clamp_min(0)
+        maps = filter2d_separable(torch.cat([x, y, x * x + y * y, x * y]), columns[None], rows[None], padding="valid")
+    mean_x, mean_y, squares, mean_xy = maps.chunk(4)
+    # rounding must not make the variances negative, or the denominator could vanish
+    variances = (squares - mean_x**2 - mean_y**2).clamp_min(0)
     structure = (2 * (mean_xy - mean_x * mean_y) + C2) / (variances + C2)
     mean_x, mean_y = mean_x + centre_x, mean_y + centre_y
     luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)

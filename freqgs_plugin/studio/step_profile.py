@@ -110,9 +110,9 @@ def instrument(sections: Sections) -> None:
     from nerfstudio.engine.optimizers import Optimizers
 
     from freqgs_plugin.functional.compiled_harmonics import CompiledHarmonics
+    from freqgs_plugin.functional.compiled_image_loss import CompiledImageSums
     from freqgs_plugin.functional.compiled_pyramid import CompiledReduce
     from freqgs_plugin.functional.compiled_spectrum import CompiledDistance
-    from freqgs_plugin.functional.compiled_ssim import CompiledSSIM
     from freqgs_plugin.rendering import numba_backend
     from freqgs_plugin.rendering import render as render_module
     from freqgs_plugin.studio import lapsplat
@@ -134,17 +134,17 @@ def instrument(sections: Sections) -> None:
     sections.replace(render_module, "level_colours", "harmonics and colours")
     for function, name in (
         (CompiledHarmonics, "harmonics and colours"),
-        (CompiledSSIM, "loss: SSIM"),
+        (CompiledImageSums, "loss: L1 and SSIM"),
         (CompiledDistance, "loss: frequency term"),
         (CompiledReduce, "loss: REDUCE"),
     ):
         sections.replace(function, "forward", name)
         sections.replace(function, "backward", name)
-    sections.replace(lapsplat, "pyramid_objective", "loss: L1 and sums")
+    sections.replace(lapsplat, "pyramid_objective", "loss: around its kernels")
     sections.replace(FreqSplatModel, "_training_targets", "loss: targets")
     sections.replace(torch.Tensor, "backward", "autograd: the rest of backward")
     sections.replace(FreqSplatModel, "get_outputs", "model: activations, cameras")
-    sections.replace(FreqSplatModel, "get_loss_dict", "loss: L1 and sums")
+    sections.replace(FreqSplatModel, "get_loss_dict", "loss: around its kernels")
     sections.replace(lapsplat.LapSplatModel, "get_metrics_dict", "metrics")
     sections.replace(FreqSplatModel, "_check_gradients", "guard: finite gradients")
     sections.replace(FreqSplatModel, "_begin_step", "densification and stages")
