@@ -89,6 +89,16 @@ class Splats:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def select(self, rows: Tensor) -> "Splats":
+        """The splats at `rows` (a boolean mask [n] or indices)."""
+        return Splats(
+            means=self.means[rows],
+            quats=self.quats[rows],
+            scales=self.scales[rows],
+            opacities=self.opacities[rows],
+            features=self.features[rows],
+        )
+
 
 @dataclass(frozen=True)
 class Rendering:

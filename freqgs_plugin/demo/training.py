@@ -2,19 +2,18 @@
 
 import re
 import shlex
-import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from freqgs_plugin.reports.child import child
+
 STEP = re.compile(r"^\s*(\d+) \(\d+(?:\.\d+)?%\)")
 """a line of nerfstudio's LocalWriter"""
 STAGE = re.compile(r"level (\d+) of (\d+) begins")
 """a line of lapsplat's log"""
-PATIENCE = 20
-"""seconds for a stopped child to end by itself"""
 
 
 class TrainingError(RuntimeError):
@@ -91,30 +90,17 @@ def train(run: TrainingRun, log: Path, on_step: Callable[[int, str | None], None
         TrainingError: ns-train failed; the message holds the end of the log.
         KeyboardInterrupt: passed on, after the child has ended.
     """
-    # a session of its own keeps Ctrl-C from the child, so that we end it in an orderly way
     command = [sys.executable, "-u", "-m", "nerfstudio.scripts.train", *run.arguments()]
-    child = subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        start_new_session=True,
-    )
     tail: deque[str] = deque(maxlen=25)
-    try:
-        assert child.stdout is not None
-        with child.stdout as lines, log.open("w", encoding="utf-8") as file:
-            file.write(shlex.join(command) + "\n")
-            for line in lines:
-                file.write(line)
-                file.flush()
-                tail.append(line)
-                _report(line, on_step)
-        code = child.wait()
-    finally:
-        _end(child)
+    with child(command) as process, log.open("w", encoding="utf-8") as file:
+        assert process.stdout is not None
+        file.write(shlex.join(command) + "\n")
+        for line in process.stdout:
+            file.write(line)
+            file.flush()
+            tail.append(line)
+            _report(line, on_step)
+    code = process.returncode
     if code != 0 or not run.config_path.is_file():
         raise TrainingError(
             f"ns-train ended with exit status {code}. All of its output is in {log}; the end:\n{''.join(tail)}"
@@ -127,15 +113,3 @@ def _report(line: str, on_step: Callable[[int, str | None], None]) -> None:
         on_step(0, f"training level {stage[1]} of {stage[2]}")
     elif step:
         on_step(int(step[1]), None)
-
-
-def _end(child: "subprocess.Popen[str]") -> None:
-    """Ask the child to end, then make it."""
-    if child.poll() is not None:
-        return
-    child.terminate()
-    try:
-        child.wait(PATIENCE)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        child.wait()

@@ -141,7 +141,7 @@ def _composite_prefixes(
     renderings, rows_drawn = [], []
     for k in range(1, num_levels + 1):
         rows = torch.where(level <= k)[0]
-        part = splats if k == num_levels else _rows(splats, rows)
+        part = splats if k == num_levels else splats.select(rows)
         renderings.append(rasterizer(part, camera, depth=False, **options))
         rows_drawn.append(rows)
     if statistics == "own" and renderings[-1].info["means2d"].requires_grad:
@@ -161,12 +161,6 @@ def _distinct_prefixes(level: Int[Tensor, " n"], num_levels: int) -> list[int]:
         new = count > 0 or k in (1, num_levels) or sum(counts) < len(level)
         rank.append((rank[-1] if rank else 0) + new)
     return rank
-
-
-def _rows(splats: Splats, rows: Tensor) -> Splats:
-    return Splats(
-        splats.means[rows], splats.quats[rows], splats.scales[rows], splats.opacities[rows], splats.features[rows]
-    )
 
 
 def _with_own_statistics(renderings: list[Rendering], rows_drawn: list[Tensor], level: Tensor) -> Rendering:

@@ -33,9 +33,9 @@ class FreqSplatModelConfig(SplatfactoModelConfig):
     least_views: int = 2
     """Gaussians above level 1 that fewer training views show are removed; 0: none (ours)"""
     opacity_penalty: float = 0.0
-    """weight of the mean opacity in the loss: Gaussians that no picture needs fade and are pruned; 0: none (ours)"""
+    """weight of the mean opacity of what a view shows: Gaussians that it does not need fade and are pruned (ours)"""
     size_penalty: float = 0.0
-    """weight of the mean standard deviation, world units, in the loss; 0: none (ours)"""
+    """weight of the mean standard deviation of what a view shows, world units; 0: none (ours)"""
     dropout: float | None = 0.0
     """share of Gaussians that each training step leaves out at random, in [0, 1); 0: none; None: 0.1 if fewer than 25
     views train, else none (ours)"""

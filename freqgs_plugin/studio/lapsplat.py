@@ -56,9 +56,9 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """share of Gaussians that each training step leaves out at random, in [0, 1); 0: none; None: 0.1 if fewer than 25
     views train, else none (ours)"""
     opacity_penalty: float = 0.01
-    """weight of the mean opacity in the loss: Gaussians that no picture needs fade and are pruned; 0: none (ours)"""
+    """weight of the mean opacity of what a view shows: Gaussians that it does not need fade and are pruned (ours)"""
     size_penalty: float = 0.01
-    """weight of the mean standard deviation, world units, in the loss; 0: none (ours)"""
+    """weight of the mean standard deviation of what a view shows, world units; 0: none (ours)"""
     densify_grad_thresh: float = 0.0004
     """2D gradient, in units of half the image, above which a Gaussian grows (ours; splatfacto: 0.0008)"""
     coarse_growth_factor: float = 1.8

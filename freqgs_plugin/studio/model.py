@@ -20,7 +20,7 @@ from freqgs_plugin.studio.targets import TargetCache, ViewTarget
 from freqgs_plugin.studio.viewing import SplatViews, psnr, show
 from freqgs_plugin.training.densify import LevelStrategy
 from freqgs_plugin.training.guard import FiniteGuard, NonFiniteError
-from freqgs_plugin.training.regularise import default_dropout, drop_out, mean_opacity, mean_size
+from freqgs_plugin.training.regularise import default_dropout, drop_out, opacity_shown, size_shown
 from freqgs_plugin.training.schedule import REFERENCE_STEPS, Schedule, scaled
 from freqgs_plugin.types import Camera, Gaussians, Rendering
 
@@ -310,10 +310,12 @@ class FreqSplatModel(SplatViews):
         losses: dict[str, Any] = self._objective(outputs, self._training_targets(batch, outputs["background"]))
         if self.config.use_scale_regularization and self.step % 10 == 0:
             losses["scale_reg"] = self._scale_regularization()
+        assert self._info is not None
+        shown = self._info["radii"][0] > 0
         if self.config.opacity_penalty != 0:
-            losses["opacity"] = self.config.opacity_penalty * mean_opacity(self.opacities)
+            losses["opacity"] = self.config.opacity_penalty * opacity_shown(self.opacities, shown)
         if self.config.size_penalty != 0:
-            losses["size"] = self.config.size_penalty * mean_size(self.scales)
+            losses["size"] = self.config.size_penalty * size_shown(self.scales, shown)
         self.camera_optimizer.get_loss_dict(losses)
         if self.config.use_bilateral_grid:
             from nerfstudio.model_components.lib_bilagrid import total_variation_loss

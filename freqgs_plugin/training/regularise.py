@@ -1,23 +1,24 @@
 """What keeps a scene small, and right from views that were never seen: penalties on opacity and size, and dropout.
 
 The penalties are those of "3D Gaussian Splatting as Markov Chain Monte Carlo" (Eq. 9): a Gaussian that no picture needs
-fades until it is pruned. Dropout is DropGaussian's: what a few views show is not left to single Gaussians in front.
+fades until it is pruned. Here each view's term is on the Gaussians that it shows: what no view shows is not judged.
+Dropout is DropGaussian's: what a few views show is not left to single Gaussians in front.
 """
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def mean_opacity(logits: Float[Tensor, "n 1"]) -> Float[Tensor, ""]:
-    """Mean of sigmoid(logits); 0 without Gaussians."""
-    return torch.sigmoid(logits).sum() / max(len(logits), 1)
+def opacity_shown(logits: Float[Tensor, "n 1"], shown: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+    """Sum of sigmoid(logits) over what is shown, divided by the number of all Gaussians; 0 without Gaussians."""
+    return (torch.sigmoid(logits) * shown[:, None]).sum() / max(len(logits), 1)
 
 
-def mean_size(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
-    """Mean standard deviation over all axes, world units; 0 without Gaussians."""
-    return torch.exp(log_scales).sum() / max(log_scales.numel(), 1)
+def size_shown(log_scales: Float[Tensor, "n 3"], shown: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+    """Sum of the mean standard deviation over all axes, world units, divided and restricted likewise."""
+    return (torch.exp(log_scales) * shown[:, None]).sum() / max(log_scales.numel(), 1)
 
 
 FEW_VIEWS = 25

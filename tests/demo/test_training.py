@@ -3,8 +3,8 @@ import sys
 
 import pytest
 
-from freqgs_plugin.demo import training
 from freqgs_plugin.demo.training import TrainingError, TrainingRun, train
+from freqgs_plugin.reports import child as process
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def child(monkeypatch, code):
     """Put a small program in the place of ns-train."""
     real = subprocess.Popen
     monkeypatch.setattr(
-        training.subprocess, "Popen", lambda command, **more: real([sys.executable, "-uc", code], **more)
+        process.subprocess, "Popen", lambda command, **more: real([sys.executable, "-uc", code], **more)
     )
 
 
@@ -54,8 +54,8 @@ def test_a_run_without_a_config_is_a_failure(monkeypatch, run, tmp_path):
 def test_an_interrupt_ends_the_child(monkeypatch, run, tmp_path):
     child(monkeypatch, "import time; print('0 (0.00%)'); time.sleep(60)")
     children = []
-    popen = training.subprocess.Popen
-    monkeypatch.setattr(training.subprocess, "Popen", lambda *a, **k: children.append(popen(*a, **k)) or children[0])
+    popen = process.subprocess.Popen
+    monkeypatch.setattr(process.subprocess, "Popen", lambda *a, **k: children.append(popen(*a, **k)) or children[0])
 
     def interrupt(*_):
         raise KeyboardInterrupt

@@ -151,7 +151,7 @@ def test_rendered_weights_fade_with_distance(rasterizer):
     shown = decay(g, CAMERA) > 0
     assert bool((weight[~shown] == 0).all())
     expected = rendered_weight(g.select(shown), CAMERA, 1, decay, rasterizer=rasterizer)
-    torch.testing.assert_close(weight[shown], expected, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(weight[shown], expected, rtol=1e-5, atol=1e-5)
 
 
 class Counting:

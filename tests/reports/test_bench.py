@@ -293,14 +293,12 @@ def test_raster_from_the_command_line(tmp_path, capsys):
 
 
 def test_prefixes_of_the_bench_agree_with_a_call_for_each():
-    from freqgs_plugin.reports.bench.raster import _rows
-
     of = workload("medium", quick=True)
     rasterizer, level = get_rasterizer("numba", "cpu"), random_levels(len(of.splats), 3)
     assert isinstance(rasterizer, PrefixRasterizer)
     together = rasterizer.prefixes(of.splats, level, 3, of.camera)
     for k, picture in enumerate(together, start=1):
-        alone = rasterizer(_rows(of.splats, level <= k), of.camera, depth=False)
+        alone = rasterizer(of.splats.select(level <= k), of.camera, depth=False)
         torch.testing.assert_close(picture.features, alone.features, atol=1e-5, rtol=1e-4)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from freqgs_plugin import cli
 from freqgs_plugin.demo.dataset import SceneOptions, write_scene
-from freqgs_plugin.reports.bench import step as step_module
+from freqgs_plugin.reports import child as child_module
 from freqgs_plugin.reports.bench.options import BenchError, BenchOptions
 from freqgs_plugin.reports.bench.step import TICKS, outside, part_rows, run_profile, step_bench, step_table
 from freqgs_plugin.studio.step_profile import REST, WARM_UP, Recorder, Sections
@@ -135,19 +135,19 @@ def test_impossible_runs_are_refused(tmp_path, steps, folder, message):
 
 
 def test_a_failing_run_tells_the_end_of_its_output(tmp_path, monkeypatch):
-    real = step_module.subprocess.Popen
+    real = child_module.subprocess.Popen
     code = "print('step: 3'); print('the reason'); raise SystemExit(5)"
-    monkeypatch.setattr(step_module.subprocess, "Popen", lambda command, **o: real([sys.executable, "-c", code], **o))
+    monkeypatch.setattr(child_module.subprocess, "Popen", lambda command, **o: real([sys.executable, "-c", code], **o))
     with pytest.raises(BenchError, match=r"(?s)exit status 5.*the reason") as raised:
         run_profile(tmp_path, 100, 1, lambda what: None)
     assert "step: 3" not in str(raised.value)
 
 
 def test_progress_comes_from_the_steps(tmp_path, monkeypatch):
-    real = step_module.subprocess.Popen
+    real = child_module.subprocess.Popen
     code = "import sys\nfor i in range(200): print('step: %d' % i)\nopen(sys.argv[-1], 'w').write('{}')"
     monkeypatch.setattr(
-        step_module.subprocess, "Popen", lambda command, **o: real([sys.executable, "-c", code, *command[-2:]], **o)
+        child_module.subprocess, "Popen", lambda command, **o: real([sys.executable, "-c", code, *command[-2:]], **o)
     )
     ticks = []
     assert run_profile(tmp_path, 200, 1, ticks.append) == {}
@@ -162,7 +162,7 @@ def test_step_from_the_command_line(tmp_path):
     rows = json.loads((tmp_path / "out" / "step.json").read_text())["tables"]["step"]["rows"]
     parts = {row["part"]: row for row in rows}
     expected = {"projection", "binning", "compositing", "projection, backward", "compositing, backward", "Adam"}
-    expected |= {"loss: SSIM", "loss: frequency term", "loss: REDUCE", "harmonics and colours", REST}
+    expected |= {"loss: L1 and SSIM", "loss: frequency term", "loss: REDUCE", "harmonics and colours", REST}
     expected |= {"densification and stages", "nerfstudio: next image", "metrics", "a whole step"}
     assert expected <= set(parts)
     shares = [row["share"] for name, row in parts.items() if name != "a whole step"]

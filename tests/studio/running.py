@@ -6,8 +6,14 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
+
+import torch
+
+from freqgs_plugin.studio.checkpoint import load_run
+from freqgs_plugin.studio.viewing import psnr, show
 
 SIZE = (80, 64)
 """width and height of the images: the smallest for three levels, whose coarsest is trained at 16 px"""
@@ -48,12 +54,9 @@ def command(name, *arguments, timeout=200, folder=None):
         )
         alarm = threading.Timer(timeout, process.kill)
         alarm.start()
-        if hasattr(os, "wait4"):
-            _, status, usage = os.wait4(process.pid, 0)
-            process.returncode = os.waitstatus_to_exitcode(status)
-            _peaks.append(usage.ru_maxrss / 2**20)
-        else:
-            process.wait()
+        while process.poll() is None:
+            _peaks.append(max(_peaks.pop(), high_water_mark(process.pid)))
+            time.sleep(0.05)
         alarm.cancel()
         output.seek(0)
         return Finished(process.returncode, output.read().decode(errors="replace"))
@@ -62,9 +65,21 @@ def command(name, *arguments, timeout=200, folder=None):
 _peaks = [0.0]
 
 
+def high_water_mark(pid):
+    """The most memory that a process had resident, GB; 0 where Linux does not tell.
+
+    Not `ru_maxrss`: a child's starts at what its parent, here the whole test run, had when it was forked.
+    """
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return 0.0
+    return sum(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 2**20
+
+
 def peak_gigabytes():
-    """The most memory that any command so far had resident (Linux counts in kB)."""
-    return max(_peaks)
+    """The most memory that any command so far had resident."""
+    return _peaks[0]
 
 
 def train_arguments(scene, output, *more, timestamp="run", method="lapsplat"):
@@ -72,8 +87,6 @@ def train_arguments(scene, output, *more, timestamp="run", method="lapsplat"):
         *(method, "--data", scene, "--output-dir", output, "--experiment-name", "small", "--timestamp", timestamp),
         *("--steps-per-eval-image", "60", "--steps-per-eval-batch", "50", "--steps-per-eval-all-images", "149"),
         *("--pipeline.model.steps-scale", SCALE, "--pipeline.model.least-refine-interval", EVERY),
-        # runs of 150 steps: nothing but the pictures counts
-        *("--pipeline.model.dropout", 0, "--pipeline.model.opacity-penalty", 0, "--pipeline.model.size-penalty", 0),
         *("--vis", "tensorboard"),
         *more,
         *("colmap", "--eval-mode", "interval", "--eval-interval", "4"),
@@ -103,3 +116,31 @@ def save(trainer):
     trainer.config.save_config()
     trainer.save_checkpoint(trainer.step)
     return trainer.checkpoint_dir
+
+
+def in_render_thread(work):
+    """What `work` returns in one of the viewer's render threads."""
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine
+
+    class RenderThread(RenderStateMachine):
+        def __init__(self):
+            threading.Thread.__init__(self)
+
+        def run(self):
+            self.result = work()
+
+    thread = RenderThread()
+    thread.start()
+    thread.join()
+    return thread.result
+
+
+def gains_over_mean_colour(config):
+    """PSNR of each training view's full picture, less that of the photograph's own mean colour everywhere, dB."""
+    run = load_run(config)
+    gains = []
+    for view in run.cameras("train"):
+        with torch.no_grad():
+            picture = show(run.model.draw(run.gaussians, view.camera, run.background).features)
+        gains.append(float(psnr(picture, view.image) - psnr(view.image.mean((0, 1)).expand_as(view.image), view.image)))
+    return gains

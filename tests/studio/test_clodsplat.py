@@ -2,14 +2,12 @@
 
 import itertools
 import math
-import threading
 
 import numpy as np
 import plyfile
 import pytest
 import torch
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
-from running import SIZE, advance, save
+from running import SIZE, advance, in_render_thread, save
 from state import all_finite, consistent, optimizer_state, parameters, same, statistics
 
 from freqgs_plugin.functional.attenuation import TAU, DistanceDecay, normalised_distance
@@ -87,15 +85,16 @@ class TestStart:
     def test_the_scene_distance_is_measured(self, make):
         trainer = make()
         model = trainer.pipeline.model
-        advance(trainer, START + 1)
+        advance(trainer, START)
         gaussians = model.gaussians()
-        assert model.attenuation(2.0) == DistanceDecay(2.0, "scene", model.scene_distance, soft=True)
         largest = []
         for camera in model._train_cameras():
             distance = (gaussians.means - camera.centre).norm(dim=1)
             reference = distance / normalised_distance(gaussians, camera, "frustum_max")
             largest.append(float(reference.median()))
-        assert model.scene_distance == pytest.approx(np.median(largest), rel=0.05)
+        advance(trainer, 1)
+        assert model.scene_distance == pytest.approx(np.median(largest), rel=1e-5)
+        assert model.attenuation(2.0) == DistanceDecay(2.0, "scene", model.scene_distance, soft=True)
 
 
 class TestSteps:
@@ -381,17 +380,6 @@ def test_settings_that_cannot_be(make, settings, message):
         make(**settings)
 
 
-class RenderThread(RenderStateMachine):
-    """One of the viewer's render threads, with something else to do."""
-
-    def __init__(self, work):
-        threading.Thread.__init__(self)
-        self._work = work
-
-    def run(self):
-        self.result = self._work()
-
-
 class TestPictures:
     @pytest.fixture
     def trainer(self, make):
@@ -439,10 +427,7 @@ class TestPictures:
         camera, _ = view(trainer)
 
         def shown():
-            thread = RenderThread(lambda: dict(model.get_outputs_for_camera(camera)))
-            thread.start()
-            thread.join()
-            return thread.result
+            return in_render_thread(lambda: dict(model.get_outputs_for_camera(camera)))
 
         before = model.get_outputs_for_camera(camera)
         model.detail.value = 3.0

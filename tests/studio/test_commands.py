@@ -12,7 +12,19 @@ import pytest
 import torch
 import yaml
 from PIL import Image
-from running import DECAY_START, EVERY, SCALE, SIZE, STEPS, advance, command, peak_gigabytes, save, train_arguments
+from running import (
+    DECAY_START,
+    EVERY,
+    SCALE,
+    SIZE,
+    STEPS,
+    advance,
+    command,
+    gains_over_mean_colour,
+    peak_gigabytes,
+    save,
+    train_arguments,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -76,13 +88,13 @@ class TestTraining:
         assert min(rates) < 50 and all(v > 0 for v in rates.values())
 
     def test_it_learns(self, trained):
-        psnr = [e.value for e in metrics_of(trained.parent).Scalars("Train Metrics Dict/psnr")]
-        assert np.mean(psnr[-3:]) > 14, psnr
+        gains = gains_over_mean_colour(trained)
+        assert min(gains) > 0 and np.mean(gains) > 1, gains
 
     def test_memory(self, trained):
         print(f"peak resident memory of the commands: {peak_gigabytes():.2f} GB")
         if sys.platform == "linux":
-            assert peak_gigabytes() < 3
+            assert 0.3 < peak_gigabytes() < 3
 
 
 class TestEval:
@@ -343,9 +355,8 @@ class TestClodsplat:
         tags = {f"Train Metrics Dict/{k}" for k in ("scale", "drawn_share", "decay_mean", "dead_decay")}
         assert tags | {"Train Loss Dict/count"} <= set(events.Tags()["scalars"])
         assert {e.step >= DECAY_START for e in events.Scalars("Train Metrics Dict/scale")} == {True}
-        psnr = [e.value for e in events.Scalars("Train Metrics Dict/psnr")]
-        # by view and scale these go up and down; untrained, none is above 13.6 dB
-        assert max(psnr) > 15, psnr
+        gains = gains_over_mean_colour(faded)
+        assert min(gains) > 0 and np.mean(gains) > 1, gains
 
     def test_eval(self, faded, tmp_path):
         done = command("ns-eval", "--load-config", faded, "--output-path", tmp_path / "eval.json")
@@ -396,9 +407,12 @@ class TestClodsplat:
         state = load(faded, STEPS - 1)["pipeline"]
         sigma, logits = (state[f"_model.gauss_params.{name}"].flatten().double() for name in ("decay", "opacities"))
         faint = torch.sigmoid(logits) * torch.exp(-(0.6**2) / (2 * sigma.clamp_min(0) ** 2 + 1e-8))
-        kept = torch.logit(faint.clamp_min(1e-30)) >= -5.5373
-        assert abs(len(rows) - int(kept.sum())) <= 1 and len(rows) > 0
-        assert len(rows) != int(kept.sum()) or np.allclose(rows["opacity"], torch.logit(faint[kept]), atol=1e-4)
+        expected = torch.logit(faint.clamp_min(1e-30)).numpy()
+        # nerfstudio leaves out what is under 1/255; rounding may decide for rows at the very threshold
+        surely = -5.5373 + 1e-3
+        written, expected = rows["opacity"][rows["opacity"] > surely], expected[expected > surely]
+        assert len(written) > 0.5 * len(rows) > 0
+        np.testing.assert_allclose(written, expected, atol=1e-4)
 
     @pytest.mark.parametrize("step", [25, 75])
     def test_resume(self, faded, scene, tmp_path, step):

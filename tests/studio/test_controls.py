@@ -5,11 +5,10 @@ import threading
 
 import pytest
 import torch
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from nerfstudio.viewer_legacy.server import viewer_utils
-from running import advance
+from running import advance, in_render_thread
 
 from freqgs_plugin.functional.budget import in_view
 from freqgs_plugin.studio.cameras import to_camera
@@ -22,24 +21,6 @@ from freqgs_plugin.studio.controls import (
     lod_slider,
     uninterrupted,
 )
-
-
-class RenderThread(RenderStateMachine):
-    """One of the viewer's render threads, with something else to do."""
-
-    def __init__(self, work):
-        threading.Thread.__init__(self)
-        self._work = work
-
-    def run(self):
-        self.result = self._work()
-
-
-def in_render_thread(work):
-    thread = RenderThread(work)
-    thread.start()
-    thread.join()
-    return thread.result
 
 
 @pytest.fixture

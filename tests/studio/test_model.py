@@ -504,7 +504,7 @@ class TestAbsurd:
 
     def test_an_empty_view(self, make_trainer):
         """All Gaussians behind every camera: nothing to learn from, but no error either."""
-        trainer = make_trainer(**SHORT, opacity_penalty=0.0, size_penalty=0.0)
+        trainer = make_trainer(**SHORT)
         model = trainer.pipeline.model
         with torch.no_grad():
             model.gauss_params["means"] += 1e4

@@ -1,12 +1,10 @@
 """Training that starts from an exported scene or from another run."""
 
-import threading
 from dataclasses import replace
 
 import pytest
 import torch
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
-from running import advance, save
+from running import advance, in_render_thread, save
 from state import all_finite, consistent, parameters, same
 
 from freqgs_plugin.functional.budget import in_view
@@ -243,17 +241,6 @@ def test_what_cannot_be_started_from(start, trained, tmp_path):
         start(trained)
 
 
-class RenderThread(RenderStateMachine):
-    """One of the viewer's render threads, with something else to do."""
-
-    def __init__(self, work):
-        threading.Thread.__init__(self)
-        self._work = work
-
-    def run(self):
-        self.result = self._work()
-
-
 @pytest.mark.slow
 def test_the_viewers_budget_with_decays_and_before(plain, start):
     trainer = start(run_folder(plain))
@@ -262,10 +249,8 @@ def test_the_viewers_budget_with_decays_and_before(plain, start):
     model.eval()
 
     def drawn():
-        thread = RenderThread(lambda: model.get_outputs_for_camera(camera)["rgb"])
-        thread.start()
-        thread.join()
-        return int(model.drawn.value.split(" / ")[0].replace(",", "")), thread.result
+        picture = in_render_thread(lambda: model.get_outputs_for_camera(camera)["rgb"])
+        return int(model.drawn.value.split(" / ")[0].replace(",", "")), picture
 
     with torch.no_grad():
         seen = int(in_view(model.gaussians(), to_camera(camera)).sum())

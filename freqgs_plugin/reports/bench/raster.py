@@ -134,7 +134,7 @@ def prefix_rows(name: str, options: BenchOptions, tick: Tick) -> list[Row]:
             for r in rasterizer.prefixes(splats, level, count, of.camera, background=of.background)  # pyright: ignore
         ]
         ways[f"{count} prefixes, a call for each"] = lambda splats, level=level, count=count: [
-            _picture(rasterizer, _rows(splats, level <= k), of) for k in range(1, count + 1)
+            _picture(rasterizer, splats.select(level <= k), of) for k in range(1, count + 1)
         ]
     forward = interleaved({k: lambda way=way: _without_gradient(way, of) for k, way in ways.items()}, options.rounds)
     both = interleaved({k: lambda way=way: _with_gradient(way, of) for k, way in ways.items()}, options.rounds)
@@ -154,10 +154,6 @@ def prefix_rows(name: str, options: BenchOptions, tick: Tick) -> list[Row]:
 
 def _picture(rasterizer: Rasterizer, splats: Splats, of: Workload) -> Tensor:
     return rasterizer(splats, of.camera, background=of.background, depth=False).features
-
-
-def _rows(splats: Splats, rows: Tensor) -> Splats:
-    return Splats(*(getattr(splats, name)[rows] for name in ("means", "quats", "scales", "opacities", "features")))
 
 
 def _without_gradient(way: Callable[[Splats], list[Tensor]], of: Workload) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from collections import deque
@@ -13,6 +12,7 @@ from typing import Any
 from freqgs_plugin.reports.bench.options import BenchError, BenchOptions
 from freqgs_plugin.reports.bench.runner import Bench, Measured, Tick
 from freqgs_plugin.reports.bench.tables import BenchTable, Row, number
+from freqgs_plugin.reports.child import child
 
 COMPOSITING = ("compositing", "compositing, backward")
 TICKS = 20
@@ -49,29 +49,20 @@ def run_profile(data: Path, steps: int, threads: int, tick: Tick) -> dict[str, A
         spec.write_text(json.dumps({"data": str(data.resolve()), "output": folder, "steps": steps, "seed": SEED}))
         command = [sys.executable, "-m", "freqgs_plugin.studio.step_profile", str(spec), str(result)]
         counts = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), str(threads))
-        child = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
-            env={**os.environ, **counts},
-        )  # fmt: skip
         tail, ticked = deque(maxlen=25), 0
-        try:
-            assert child.stdout is not None
+        with child(command, {**os.environ, **counts}) as process:
+            assert process.stdout is not None
             tick("starting")
-            with child.stdout as lines:
-                for line in lines:
-                    name, _, step = line.partition("step: ")
-                    if name or not step.strip().isdigit():
-                        tail.append(line)
-                        continue
-                    reached = int(step) * (TICKS - 1) // max(steps - 1, 1)
-                    for _ in range(ticked, reached):
-                        tick(f"step {int(step)} of {steps}")
-                    ticked = max(ticked, reached)
-            code = child.wait()
-        finally:
-            if child.poll() is None:
-                child.kill()
-                child.wait()
+            for line in process.stdout:
+                name, _, step = line.partition("step: ")
+                if name or not step.strip().isdigit():
+                    tail.append(line)
+                    continue
+                reached = int(step) * (TICKS - 1) // max(steps - 1, 1)
+                for _ in range(ticked, reached):
+                    tick(f"step {int(step)} of {steps}")
+                ticked = max(ticked, reached)
+        code = process.returncode
         if code or not result.is_file():
             raise BenchError(f"training ended with exit status {code}; the end of its output:\n{''.join(tail)}")
         return json.loads(result.read_text(encoding="utf-8"))

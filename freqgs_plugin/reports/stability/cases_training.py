@@ -2,14 +2,15 @@
 
 import json
 import math
-import subprocess
 import sys
 import tempfile
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from freqgs_plugin.reports.child import child
 from freqgs_plugin.reports.stability.case import Group, Row, Setting, StabilityError
 
 STEPS = 400
@@ -26,8 +27,6 @@ _ONE_RESET = {"stop_reset_before_end": 22_000}
 _NO_RESET = {"stop_reset_before_end": 30_000}
 MARK = "rehearsal: "
 """in front of a record in the child's output; `studio.rehearsal` names the same"""
-PATIENCE = 20
-"""seconds for a stopped child to end by itself"""
 
 
 class RehearsalError(StabilityError):
@@ -143,30 +142,13 @@ def _call(module: str, *arguments: str) -> None:
 
 def _records(module: str, *arguments: str) -> Iterator[dict[str, Any]]:
     """Run a module in a process of its own; yields what it prints behind MARK, and ends it if we are ended."""
-    child = subprocess.Popen(
-        [sys.executable, "-m", module, *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        start_new_session=True,
-    )
-    tail: list[str] = []
-    try:
-        assert child.stdout is not None
-        for line in child.stdout:
+    tail: deque[str] = deque(maxlen=20)
+    with child([sys.executable, "-m", module, *arguments]) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
             if line.startswith(MARK):
                 yield json.loads(line[len(MARK) :])
             else:
-                tail = [*tail[-20:], line]
-        if child.wait() != 0:
-            raise RehearsalError(f"{module} ended with exit status {child.returncode}:\n{''.join(tail)}")
-    finally:
-        if child.poll() is None:
-            child.terminate()
-            try:
-                child.wait(PATIENCE)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()
+                tail.append(line)
+    if process.returncode != 0:
+        raise RehearsalError(f"{module} ended with exit status {process.returncode}:\n{''.join(tail)}")
