@@ -67,7 +67,7 @@ def _feature_groups(features: Tensor) -> list[Any]:
 
 
 class _Composite(torch.autograd.Function):
-    """(splats, means2d probe, view matrix, background [d]) -> features [prefixes, h, w, d] over the background, light
+    """(splats, means2d probe, view matrix, background [d]) -> planes [prefixes, d, h, w] over the background, light
     [prefixes, h, w], depth [h, w].
     """
 
@@ -81,7 +81,7 @@ class _Composite(torch.autograd.Function):
         images = []
         backgrounds = _feature_groups(background[None])
         for number, group in enumerate(_feature_groups(features)):
-            image = torch.empty(*shape, _CHANNELS)
+            image = torch.empty(view.prefixes, _CHANNELS, view.height, view.width)
             composite(
                 *view.lists[:3], view.splats, _array(depths), view.level, view.prefixes, group,
                 backgrounds[number][0], with_depth and number == 0, view.width, view.height,
@@ -91,12 +91,11 @@ class _Composite(torch.autograd.Function):
         ctx.save_for_backward(means, quats, scales, opacities, features, light, *images)
         ctx.view, ctx.probe = view, probe
         ctx.mark_non_differentiable(depth)
-        return torch.cat(images, -1)[..., : features.shape[1]] if len(images) > 1 else images[0][
-            ..., : features.shape[1]
-        ], light, depth  # fmt: skip
+        planes = torch.cat(images, 1) if len(images) > 1 else images[0]
+        return planes[:, : features.shape[1]], light, depth
 
     @staticmethod
-    def backward(ctx, v_features, v_light, _v_depth):
+    def backward(ctx, v_planes, v_light, _v_depth):
         means, quats, scales, opacities, features, light, *images = ctx.saved_tensors
         view: _View = ctx.view
         offsets, ids, boxes, slots, first, count = view.lists
@@ -105,9 +104,10 @@ class _Composite(torch.autograd.Function):
         moves, wants_pose = any(ctx.needs_input_grad[:4]) or ctx.needs_input_grad[6], ctx.needs_input_grad[6]
         total, v_feature_groups = {}, []
         for number, group in enumerate(_feature_groups(features)):
-            v_image = v_features[..., number * _CHANNELS : (number + 1) * _CHANNELS]
-            if v_image.shape[-1] < _CHANNELS:
-                v_image = torch.nn.functional.pad(v_image, (0, _CHANNELS - v_image.shape[-1]))
+            v_image = v_planes[:, number * _CHANNELS : (number + 1) * _CHANNELS]
+            missing = _CHANNELS - v_image.shape[1]
+            if missing:
+                v_image = torch.nn.functional.pad(v_image, (0, 0, 0, 0, 0, missing))
             composite_backward(
                 offsets, ids, boxes, slots, view.splats, view.level, view.prefixes, view.own, group,
                 view.width, view.height, images[number].numpy(), light.numpy(), _array(v_image),
@@ -130,7 +130,7 @@ class _Composite(torch.autograd.Function):
         if ctx.needs_input_grad[6]:
             rows = total["view"].double().sum(0).float()
             v_pose = torch.cat([torch.cat([rows[:9].view(3, 3), rows[9:, None]], 1), torch.zeros(1, 4)])
-        v_background = (v_features * light[..., None]).sum((0, 1, 2)) if ctx.needs_input_grad[7] else None
+        v_background = (v_planes * light[:, None]).sum((0, 2, 3)) if ctx.needs_input_grad[7] else None
         v_all = torch.cat(v_feature_groups, 1) if len(v_feature_groups) > 1 else v_feature_groups[0]
         return (
             total["means"], total["quats"], total["scales"], total["opacity"][:, 0], v_all[:, :d], total["xy"][None],
@@ -215,7 +215,7 @@ class NumbaRasterizer:
         means2d.requires_grad_(wants_grad)
         behind = splats.features.new_zeros(1) if background is None else background.to(splats.features)
         behind = behind.expand(splats.features.shape[1])
-        features, light, z = _Composite.apply(
+        planes, light, z = _Composite.apply(
             splats.means, splats.quats, splats.scales, splats.opacities, splats.features, means2d, camera.viewmat,
             behind, view, depths, depth, means2d if wants_grad and self.absgrad else None,
         )  # fmt: skip
@@ -236,9 +236,13 @@ class NumbaRasterizer:
             "n_cameras": 1,
             "tile_size": 16,
         }
-        # unbind: the gradient of indexing one by one would be an image of zeros per prefix
-        pictures = zip(features.unbind(0), alpha.unbind(0), strict=True)
-        return [Rendering(f, a, expected, info if k == prefixes - 1 else {}) for k, (f, a) in enumerate(pictures)]
+        # unbind: the gradient of indexing one by one would be an image of zeros per prefix. In memory the pictures stay
+        # planes, as losses want them
+        pictures = zip(planes.unbind(0), alpha.unbind(0), strict=True)
+        return [
+            Rendering(p.permute(1, 2, 0), a, expected, info if k == prefixes - 1 else {})
+            for k, (p, a) in enumerate(pictures)
+        ]
 
 
 _warm = False

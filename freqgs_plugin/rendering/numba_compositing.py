@@ -141,7 +141,7 @@ def composite(
     offsets, ids, boxes, splats, depths, level, prefixes, features, background, with_depth, width, height,
     image, light, depth,
 ):  # fmt: skip
-    """Fill `image` [prefixes, h, w, 3], `light` (final transmittance) [prefixes, h, w] and, if asked, `depth` [h, w].
+    """Fill `image` [prefixes, 3, h, w], `light` (final transmittance) [prefixes, h, w] and, if asked, `depth` [h, w].
 
     `background` [3] fills what light is left.
 
@@ -196,9 +196,9 @@ def composite(
                     p = _pixel(x, row)
                     y, c = ty * TILE + row, tx * TILE + x
                     left_over = abs(block[p + LIGHT * PIXELS])
-                    image[k, y, c, 0] = block[p + F0 * PIXELS] + left_over * background[0]
-                    image[k, y, c, 1] = block[p + F1 * PIXELS] + left_over * background[1]
-                    image[k, y, c, 2] = block[p + F2 * PIXELS] + left_over * background[2]
+                    image[k, 0, y, c] = block[p + F0 * PIXELS] + left_over * background[0]
+                    image[k, 1, y, c] = block[p + F1 * PIXELS] + left_over * background[1]
+                    image[k, 2, y, c] = block[p + F2 * PIXELS] + left_over * background[2]
                     light[k, y, c] = left_over
                     if with_depth:
                         depth[y, c] = block[p + DEPTH * PIXELS]
@@ -211,9 +211,9 @@ def _start_gradient(scratch, at, tx, ty, width, height, image, light, v_image, v
         for x in range(min(TILE, width - tx * TILE)):
             p = at + _pixel(x, row)
             y, c = ty * TILE + row, tx * TILE + x
-            g0, g1, g2 = v_image[y, c, 0], v_image[y, c, 1], v_image[y, c, 2]
+            g0, g1, g2 = v_image[0, y, c], v_image[1, y, c], v_image[2, y, c]
             scratch[p + G0 * PIXELS], scratch[p + G1 * PIXELS], scratch[p + G2 * PIXELS] = g0, g1, g2
-            done = g0 * image[y, c, 0] + g1 * image[y, c, 1] + g2 * image[y, c, 2]
+            done = g0 * image[0, y, c] + g1 * image[1, y, c] + g2 * image[2, y, c]
             scratch[p + REST * PIXELS] = done + light[y, c] * v_light[y, c]
 
 
