@@ -6,6 +6,7 @@ Camera axes are OpenCV's: x right, y down, z forward. Pixel centres lie at +0.5.
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -39,15 +40,16 @@ class Gaussians:
 
     def select(self, rows: Tensor) -> "Gaussians":
         """The Gaussians at `rows` (a boolean mask [n] or indices)."""
+        rows = _indices(rows)
         return Gaussians(
-            means=self.means[rows],
-            quats=self.quats[rows],
-            scales=self.scales[rows],
-            opacities=self.opacities[rows],
-            sh=self.sh[rows],
-            level=self.level[rows],
+            means=self.means.index_select(0, rows),
+            quats=self.quats.index_select(0, rows),
+            scales=self.scales.index_select(0, rows),
+            opacities=self.opacities.index_select(0, rows),
+            sh=self.sh.index_select(0, rows),
+            level=self.level.index_select(0, rows),
             signed_residuals=self.signed_residuals,
-            decay=None if self.decay is None else self.decay[rows],
+            decay=None if self.decay is None else self.decay.index_select(0, rows),
         )
 
 
@@ -91,12 +93,13 @@ class Splats:
 
     def select(self, rows: Tensor) -> "Splats":
         """The splats at `rows` (a boolean mask [n] or indices)."""
+        rows = _indices(rows)
         return Splats(
-            means=self.means[rows],
-            quats=self.quats[rows],
-            scales=self.scales[rows],
-            opacities=self.opacities[rows],
-            features=self.features[rows],
+            means=self.means.index_select(0, rows),
+            quats=self.quats.index_select(0, rows),
+            scales=self.scales.index_select(0, rows),
+            opacities=self.opacities.index_select(0, rows),
+            features=self.features.index_select(0, rows),
         )
 
 
@@ -112,3 +115,8 @@ class Rendering:
     """expected camera z (weighted mean over what was hit), world units; 0 where nothing was hit; no gradient"""
     info: dict[str, Any] = field(default_factory=dict)
     """gsplat's keys for the densification strategy: means2d, radii, width, height, n_cameras ..."""
+
+
+def _indices(rows: Tensor) -> Tensor:
+    """A mask searched once instead of once per tensor."""
+    return rows.nonzero().squeeze(1) if rows.dtype == torch.bool else rows

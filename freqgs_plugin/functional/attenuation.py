@@ -108,9 +108,9 @@ class DistanceDecay:
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
         distance = normalised_distance(gaussians, camera, self.reference, self.scene_distance)
-        decay = decay_of(gaussians)
-        margin = log_attenuated(gaussians.opacities, distance, decay, self.scale) - math.log(TAU * self.scale)
-        weight = torch.exp(log_decay(distance, decay, self.scale))
+        exponent = log_decay(distance, decay_of(gaussians), self.scale)
+        margin = _log_opacity(gaussians.opacities) + exponent - math.log(TAU * self.scale)
+        weight = torch.exp(exponent)
         if not self.soft:
             return weight * (margin > 0)
         fade = torch.expm1(margin.clamp(0.0, math.log(2.0))).clamp_max(1.0)
@@ -139,7 +139,11 @@ def log_attenuated(
 
     α counts as at least 1e-30, so that the logarithm is finite; below, its gradient is 0.
     """
-    return _at_least_float32(opacities).clamp_min(_LEAST_OPACITY).log() + log_decay(distance, decay, scale)
+    return _log_opacity(opacities) + log_decay(distance, decay, scale)
+
+
+def _log_opacity(opacities: Tensor) -> Tensor:
+    return _at_least_float32(opacities).clamp_min(_LEAST_OPACITY).log()
 
 
 def normalised_distance(
@@ -154,13 +158,13 @@ def normalised_distance(
         ValueError: the reference `scene` without a distance > 0.
     """
     _check_reference(reference, scene_distance)
-    distance, in_frustum = _distances(gaussians, camera)
+    distance, positions = _distances(gaussians, camera)
     if reference == "scene":
         assert scene_distance is not None
         return distance / scene_distance
     if not len(distance):
         return distance
-    largest = _frustum_distance(distance, in_frustum, reference)
+    largest = _frustum_distance(distance, _in_frustum(positions, camera), reference)
     return torch.where(largest > 0, distance / torch.where(largest > 0, largest, 1.0), 0.0)
 
 
@@ -168,28 +172,35 @@ def frustum_distance(
     gaussians: Gaussians, camera: Camera, reference: Literal["frustum_max", "frustum_quantile"] = "frustum_max"
 ) -> float:
     """The distance that `normalised_distance` divides by for one view, world units; 0 without Gaussians."""
-    distance, in_frustum = _distances(gaussians, camera)
-    return float(_frustum_distance(distance, in_frustum, reference)) if len(distance) else 0.0
+    distance, positions = _distances(gaussians, camera)
+    return float(_frustum_distance(distance, _in_frustum(positions, camera), reference)) if len(distance) else 0.0
 
 
 @torch.no_grad()
-def _distances(gaussians: Gaussians, camera: Camera) -> tuple[Float[Tensor, " n"], Bool[Tensor, " n"]]:
-    """World distance of each mean from the camera's centre, and which means the image shows."""
+def _distances(gaussians: Gaussians, camera: Camera) -> tuple[Float[Tensor, " n"], Float[Tensor, "3 n"]]:
+    """World distance of each mean from the camera's centre, and its position on the camera's axes."""
     means = _at_least_float32(gaussians.means)
     # autocast would take these products at half precision
     with torch.autocast(means.device.type, enabled=False):
-        viewmat, intrinsics = camera.viewmat.to(means), camera.K.to(means)
+        viewmat = camera.viewmat.to(means)
         # about a rounded camera centre, so that scenes far from the origin keep their digits
         exact = camera.viewmat[:3].to("cpu", torch.float64)
         centre = (-exact[:, :3].T @ exact[:, 3]).to(means)
         rest = exact[:, 3] + exact[:, :3] @ centre.to("cpu", torch.float64)
-        x, y, z = torch.addmm(rest[:, None].to(means), viewmat[:3, :3], (means - centre).T)
+        positions = torch.addmm(rest[:, None].to(means), viewmat[:3, :3], (means - centre).T)
+    return torch.hypot(torch.hypot(positions[0], positions[1]), positions[2]), positions
+
+
+@torch.no_grad()
+def _in_frustum(positions: Float[Tensor, "3 n"], camera: Camera) -> Bool[Tensor, " n"]:
+    """Which means the image shows."""
+    x, y, z = positions
+    intrinsics = camera.K.to(positions)
     front = z > NEAR_PLANE
     depth = torch.where(front, z, 1.0)
     u = x / depth * intrinsics[0, 0] + intrinsics[0, 2]
     v = y / depth * intrinsics[1, 1] + intrinsics[1, 2]
-    inside = front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-    return torch.hypot(torch.hypot(x, y), z), inside
+    return front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
 
 
 def _frustum_distance(
