@@ -48,7 +48,7 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     """sigma of every Gaussian at first, in normalised distances (ours; the paper does not say)"""
     largest_scale: float = 5.0
     """s_max: training draws its virtual distance scale from U(1, s_max) (the paper: 1, 3, 5 or 7)"""
-    full_detail_every: int = 4
+    full_detail_every: int = 2
     """every so many steps the scale is 1 (ours); 0: only by chance (the paper)"""
     weigh_scales: bool = True
     """steps at larger scales count less, by w_s of Eq. 5 (the paper)"""
@@ -77,6 +77,8 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     """Gaussians with sigma <= 0, which nothing brings back: removed, or kept from it by a least_decay (ours)"""
     least_decay: float = 0.25
     """sigma is held at or above this where dead_decay is keep (ours)"""
+    densify_grad_thresh: float = 0.001
+    """2D gradient, in units of half the image, above which a Gaussian grows (ours; splatfacto: 0.0008)"""
     detail_scales: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 5.0)
     """scales that are evaluated, and offered as outputs detail_1, detail_1.5 ..."""
     init_from: Path | None = None
