@@ -77,8 +77,6 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     """Gaussians with sigma <= 0, which nothing brings back: removed, or kept from it by a least_decay (ours)"""
     least_decay: float = 0.25
     """sigma is held at or above this where dead_decay is keep (ours)"""
-    densify_grad_thresh: float = 0.001
-    """2D gradient, in units of half the image, above which a Gaussian grows (ours; splatfacto: 0.0008)"""
     detail_scales: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 5.0)
     """scales that are evaluated, and offered as outputs detail_1, detail_1.5 ..."""
     init_from: Path | None = None
