@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
+from freqgs_plugin.functional.compiled_rows import row_sum
 from freqgs_plugin.functional.image_loss import C1, C2, TAPS
 from freqgs_plugin.functional.numba_threads import njit, prange
 
@@ -87,14 +88,6 @@ def _similarity_of_row(x, y, squares, products, centre_x, centre_y, by_x, by_xx,
         by_x[j] = two * ((b * structure - a * value) * per_luminance + (dx * value - dy * luminance) * per_variance)
 
 
-@njit(fastmath={"reassoc"}, error_model="numpy", cache=True, nogil=True)
-def _sum(line):
-    total = 0.0
-    for j in range(line.size):
-        total += line[j]
-    return total
-
-
 @njit(parallel=True, fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
 def _similarity(x, y, rows, columns, centres, sums, slopes):
     """Per strip of windows: blur the moments along every row, then down the strip, then SSIM and derivatives."""
@@ -122,7 +115,7 @@ def _similarity(x, y, rows, columns, centres, sums, slopes):
             _similarity_of_row(
                 maps[0], maps[1], maps[2], maps[3], centres[0, p], centres[1, p], by_x, by_xx, by_xy, maps[4]
             )
-            total += _sum(maps[4])
+            total += row_sum(maps[4])
         sums[p, task % strips] = total
 
 
@@ -156,5 +149,5 @@ def _gradient(x, y, rows, columns, centres, slopes, by_ssim, by_l1, sums, out):
                 _blur_across(blurred[c, i : i + 11], rows, maps[c])
             a, b, o = x[p, top + i], y[p, top + i], out[p, top + i]
             _gradient_of_row(maps[0], maps[1], maps[2], a, b, centres[0, p], centres[1, p], by_ssim, by_l1, maps[3], o)
-            total += _sum(maps[3])
+            total += row_sum(maps[3])
         sums[p, task % strips] = total

@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from freqgs_plugin.functional.compiled_rows import row_sum
 from freqgs_plugin.functional.numba_threads import njit, prange
 
 
@@ -126,14 +127,6 @@ def _magnitudes(spectrum, out):
             _polar(parts[2], parts[3], out[2 * p + 1, u])
 
 
-@njit(fastmath={"reassoc"}, error_model="numpy", cache=True, nogil=True)
-def _sum(line):
-    total = 0.0
-    for v in range(line.size):
-        total += line[v]
-    return total
-
-
 @njit(error_model="numpy", cache=True, nogil=True)
 def _difference(real, imaginary, size, target, width):
     """Sum of | |F| - T | over a row of the full plane; real and imaginary part become the derivative's.
@@ -147,7 +140,7 @@ def _difference(real, imaginary, size, target, width):
         real[v], imaginary[v], size[v] = sign * real[v], sign * imaginary[v], abs(difference)
     # the bins in the other half of the plane are mirror images of those at 0 < v < width / 2
     alone = size[0] + size[width // 2] if width % 2 == 0 else size[0]
-    return 2 * _sum(size) - alone
+    return 2 * row_sum(size) - alone
 
 
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)
