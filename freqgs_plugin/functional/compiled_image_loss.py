@@ -15,8 +15,8 @@ _STRIP = 32
 class CompiledImageSums(torch.autograd.Function):
     """`by_ssim` * (sum of SSIM over windows) + `by_l1` * (sum of |x - y|), of planes `[p h w]`.
 
-    11 taps per axis. The gradient for the first image is made in the forward pass. `centres` [2, p] are subtracted
-    from the planes of both images before SSIM: see `image_loss`.
+    11 taps per axis. The gradient for the first image is made in the forward pass, where it or L1 is wanted.
+    `centres` [2, p] are subtracted from the planes of both images before SSIM: see `image_loss`.
     """
 
     @staticmethod
@@ -26,13 +26,14 @@ class CompiledImageSums(torch.autograd.Function):
         pair, scalar = (x.numpy(), y.numpy()), x.numpy().dtype.type
         taps = rows.astype(scalar), columns.astype(scalar)
         similarity = np.empty((planes, -(-(height - TAPS + 1) // _STRIP)))
-        distance = np.empty((planes, -(-height // _STRIP)))
+        distance = np.zeros((planes, -(-height // _STRIP)))
         # derivatives by mean_x, mean_xx and mean_xy per window, with the zeros around that their blur backwards needs
         slopes = np.zeros((3, planes, height + TAPS - 1, width + TAPS - 1), scalar)
         _similarity(*pair, *taps, centres.numpy(), similarity, slopes)
-        gradient = torch.empty_like(x)
-        _gradient(*pair, *taps, centres.numpy(), slopes, scalar(by_ssim), scalar(by_l1), distance, gradient.numpy())
-        ctx.save_for_backward(gradient)
+        if ctx.needs_input_grad[0] or by_l1 != 0:
+            gradient = torch.empty_like(x)
+            _gradient(*pair, *taps, centres.numpy(), slopes, scalar(by_ssim), scalar(by_l1), distance, gradient.numpy())
+            ctx.save_for_backward(gradient)
         return x.new_tensor(by_ssim * similarity.sum() + by_l1 * distance.sum())
 
     @staticmethod

@@ -128,6 +128,12 @@ def test_image_distance_is_the_weighted_sum(weight):
     assert image_distance(a, b, weight).item() == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.parametrize("weight", [0.2, 1.0])
+def test_values_are_the_same_without_a_gradient(weight):
+    a, b = pair(1, 3, 23, 18)
+    assert torch.equal(image_distance(a, b, weight), image_distance(a.clone().requires_grad_(), b, weight).detach())
+
+
 def test_weight_zero_does_not_compute_ssim(monkeypatch):
     monkeypatch.setattr(image_loss, "_compiled_sums", lambda *_: pytest.fail("computed"))
     image_distance(*pair(1, 3, 12, 12), 0.0)
