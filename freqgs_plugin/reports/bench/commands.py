@@ -19,6 +19,14 @@ def raster(options: Options = BenchOptions()) -> None:  # noqa: B008
     run_bench(raster_bench(options), options, _console())
 
 
+def cuda(options: Options = BenchOptions()) -> None:  # noqa: B008
+    """Time gsplat beside the torch reference on a CUDA device; memory, and errors against float64."""
+    from freqgs_plugin.reports.bench.cuda import cuda_bench
+    from freqgs_plugin.reports.bench.runner import run_bench
+
+    run_bench(cuda_bench(options), options, _console())
+
+
 def scaling(options: Options = BenchOptions()) -> None:  # noqa: B008
     """Time numba and torch as Gaussians and pixels become more, and fit the exponents."""
     from freqgs_plugin.reports.bench.runner import run_bench
@@ -82,5 +90,5 @@ def _console() -> Any:
     return Console() if sys.stdout.isatty() else Console(width=200)
 
 
-BENCHES = {"raster": raster, "scaling": scaling, "accuracy": accuracy, "step": step, "savings": savings}
+BENCHES = {"raster": raster, "cuda": cuda, "scaling": scaling, "accuracy": accuracy, "step": step, "savings": savings}
 """name on the command line -> function"""
