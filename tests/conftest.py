@@ -6,6 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import settings
+
+# a slow machine is no failure
+settings.register_profile("freqgs", deadline=None)
+settings.load_profile("freqgs")
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent / "rendering")]
 

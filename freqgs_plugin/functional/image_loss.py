@@ -125,6 +125,12 @@ def _window(side: int) -> np.ndarray:
     return taps / taps.sum()
 
 
+@lru_cache(maxsize=16)
+def _window_on(side: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`_window` as a tensor; kept, because a copy to a CUDA device waits for it."""
+    return torch.as_tensor(_window(side), dtype=dtype, device=device)
+
+
 def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:
     """SSIM in plain torch: any device, both gradients."""
     from kornia.filters import filter2d_separable
@@ -132,7 +138,7 @@ def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:
     height, width = x.shape[2:]
     centre_x, centre_y = _plane_means(x), _plane_means(y)
     x, y = x - centre_x, y - centre_y
-    rows, columns = (torch.as_tensor(_window(side), dtype=x.dtype, device=x.device) for side in (height, width))
+    rows, columns = (_window_on(side, x.dtype, x.device) for side in (height, width))
     # variances are differences of blurred squares: half precision would leave nothing of them
     with torch.autocast(x.device.type, enabled=False):
         maps = filter2d_separable(torch.cat([x, y, x * x + y * y, x * y]), columns[None], rows[None], padding="valid")

@@ -113,20 +113,21 @@ def check_inputs(splats: Splats, camera: Camera) -> None:
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"camera is {camera.width}x{camera.height} px; both sides must be at least 1.")
     for name in ("viewmat", "K"):
-        matrix: Tensor = getattr(camera, name)
-        if not bool(torch.isfinite(matrix).all()):
-            raise ValueError(
-                f"the camera's {name} is not finite: {matrix.tolist()}. Check the camera's pose and model."
-            )
-    focal = [float(camera.K[k, k]) for k in range(2)]
-    if not min(focal) > 0:
-        raise ValueError(f"focal lengths are {focal[0]:g} and {focal[1]:g} px; both must be > 0.")
-    for name in ("means", "quats", "scales", "opacities", "features"):
-        values: Tensor = getattr(splats, name).detach()
+        rows = getattr(camera, name).tolist()
+        if not all(math.isfinite(x) for row in rows for x in row):
+            raise ValueError(f"the camera's {name} is not finite: {rows}. Check the camera's pose and model.")
+        if name == "K" and not min(rows[0][0], rows[1][1]) > 0:
+            raise ValueError(f"focal lengths are {rows[0][0]:g} and {rows[1][1]:g} px; both must be > 0.")
+    tensors: dict[str, Tensor] = {
+        name: getattr(splats, name).detach() for name in ("means", "quats", "scales", "opacities", "features")
+    }
+    for name, values in tensors.items():
         if values.dtype != splats.means.dtype:
             raise TypeError(f"{name} are {values.dtype} but means are {splats.means.dtype}; give all one dtype.")
-        # one pass without a mask; a finite sum has finite terms only
-        if math.isfinite(float(values.sum(dtype=_sum_dtype(values)))):
+    # one pass without a mask; a finite sum has finite terms only. Read together: each read waits for a CUDA device
+    sums = torch.stack([values.sum(dtype=_sum_dtype(values)) for values in tensors.values()]).tolist()
+    for (name, values), total in zip(tensors.items(), sums, strict=True):
+        if math.isfinite(total):
             continue
         bad = ~torch.isfinite(values).reshape(len(values), -1).all(-1)
         rows = torch.nonzero(bad).squeeze(1)
@@ -137,6 +138,21 @@ def check_inputs(splats: Splats, camera: Camera) -> None:
                 f"{values[first].tolist()}). Remove these Gaussians; in training, lower the learning rates, or go back "
                 "to a checkpoint before they appeared."
             )
+
+
+def check_levels(level: Int[Tensor, " n"], num_levels: int) -> None:
+    """Refuse levels outside of 1..num_levels.
+
+    Raises:
+        ValueError: with the range there is.
+    """
+    if len(level) == 0:
+        return
+    low, high = torch.stack(torch.aminmax(level)).tolist()
+    if not 1 <= low <= high <= num_levels:
+        raise ValueError(
+            f"levels run from {low} to {high}, outside of 1..{num_levels}; pass the number of levels of the model."
+        )
 
 
 def check_entries(entries: int, gaussians: int, camera: Camera) -> None:

@@ -13,7 +13,7 @@ from numba import get_num_threads
 from torch import Tensor
 
 from freqgs_plugin.functional.numba_threads import check_layer
-from freqgs_plugin.rendering.base import BLUR, Statistics, check_entries, check_inputs
+from freqgs_plugin.rendering.base import BLUR, Statistics, check_entries, check_inputs, check_levels
 from freqgs_plugin.rendering.numba_binning import depth_order, tile_lists
 from freqgs_plugin.rendering.numba_compositing import composite, composite_backward
 from freqgs_plugin.rendering.numba_projection import COLUMNS, OPACITY, V_COLUMNS, project, project_backward
@@ -177,11 +177,7 @@ class NumbaRasterizer:
         statistics: Statistics = "full",
     ) -> list[Rendering]:
         """See `PrefixRasterizer.prefixes`."""
-        if len(level) and not 1 <= int(level.min()) <= int(level.max()) <= num_levels:
-            raise ValueError(
-                f"levels run from {int(level.min())} to {int(level.max())}, outside of 1..{num_levels}; "
-                "pass the number of levels of the model."
-            )
+        check_levels(level, num_levels)
         own = statistics == "own"
         return self._render(splats, level.int(), num_levels, camera, background, blur, antialiased, own, False)
 

@@ -7,6 +7,8 @@ from torch import Tensor
 
 from freqgs_plugin.types import Camera
 
+_READ = ("camera_type", "width", "height", "fx", "fy", "cx", "cy")
+
 
 def to_camera(camera: Cameras, camera_to_world: Float[Tensor, "1 3 4"] | None = None, *, halvings: int = 0) -> Camera:
     """The pinhole view of a single nerfstudio camera (OpenGL axes: x right, y up, z backward).
@@ -21,7 +23,9 @@ def to_camera(camera: Cameras, camera_to_world: Float[Tensor, "1 3 4"] | None = 
     """
     if camera.shape[0] != 1:
         raise ValueError(f"got {camera.shape[0]} cameras; a splat model renders one at a time.")
-    kind = int(camera.camera_type.flatten()[0])
+    # read together: on CUDA each read waits for the device
+    read = torch.cat([getattr(camera, name).flatten()[:1].double() for name in _READ]).tolist()
+    kind, width, height = (int(value) for value in read[:3])
     if kind != CameraType.PERSPECTIVE.value:
         name = next((t.name for t in CameraType if t.value == kind), str(kind))
         raise ValueError(
@@ -35,6 +39,6 @@ def to_camera(camera: Cameras, camera_to_world: Float[Tensor, "1 3 4"] | None = 
     viewmat = torch.cat([rotation.T, translation[:, None]], 1)
     viewmat = torch.cat([viewmat, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
     factor = 2**halvings
-    fx, fy, cx, cy = (float(v) / factor for v in (camera.fx, camera.fy, camera.cx, camera.cy))
+    fx, fy, cx, cy = (value / factor for value in read[3:])
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=pose.dtype, device=pose.device)
-    return Camera(viewmat, K, max(int(camera.width) // factor, 1), max(int(camera.height) // factor, 1))
+    return Camera(viewmat, K, max(width // factor, 1), max(height // factor, 1))

@@ -37,7 +37,13 @@ def projection(splats, camera, blur):
 def render_dense(splats, camera, *, background=None, blur=0.3, antialiased=False):
     radii, means2d, depths, conics, compensations = projection(splats, camera, blur)
     opacities = splats.opacities * compensations if antialiased else splats.opacities
-    h, w = camera.height, camera.width
+    return composite_dense(
+        means2d, depths, conics, opacities, splats.features, radii, (camera.height, camera.width), background
+    )
+
+
+def composite_dense(means2d, depths, conics, opacities, features, radii, size, background=None):
+    h, w = size
     y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
     pixels = torch.stack([x, y], -1).reshape(1, h * w, 2).to(means2d)
     means2d = means2d[:, None].expand(-1, h * w, -1).clone()
@@ -54,7 +60,8 @@ def render_dense(splats, camera, *, background=None, blur=0.3, antialiased=False
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
     weight = alpha * before * (after > TRANSMITTANCE_MIN)
     hit = weight.sum(0)
-    features = torch.einsum("np,nd->pd", weight, splats.features[order])
+    features_of_order = features[order]
+    features = torch.einsum("np,nd->pd", weight, features_of_order)
     if background is not None:
         features = features + (1 - hit)[:, None] * background
     depth = (weight * depths[order, None]).sum(0).detach() / torch.where(hit > 0, hit, 1.0).detach()

@@ -8,10 +8,13 @@ import gsplat
 import pytest
 import scenes
 import torch
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+from reference import composite_dense
 
 from freqgs_plugin.rendering import gsplat_backend
 from freqgs_plugin.rendering.base import NEAR_PLANE
 from freqgs_plugin.rendering.gsplat_backend import GsplatRasterizer
+from freqgs_plugin.rendering.torch_backend import TorchRasterizer
 
 SIGNATURE = inspect.signature(gsplat.rasterization)
 META_IN_SOURCE = inspect.getsource(gsplat.rasterization)
@@ -47,6 +50,40 @@ def fake(monkeypatch):
     monkeypatch.setattr(gsplat, "rasterization", rasterization)
     monkeypatch.setattr(gsplat_backend, "_missing", lambda device: None)
     return rasterization
+
+
+@pytest.fixture
+def kernels(monkeypatch):
+    """Replaces the kernels by gsplat's own torch projection and dense compositing, in any dtype on the CPU."""
+
+    def fully_fused_projection(means, covars, quats, scales, viewmats, Ks, width, height, **options):
+        assert covars is None and options.pop("packed") is False
+        covariances, _ = _quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+        return _fully_fused_projection(means, covariances, viewmats, Ks, width, height, **options)
+
+    def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height, *, packed, n_cameras):
+        assert (tile_width, tile_height) == (3, 2) and tile_size == 16 and not packed
+        assert means2d.shape == (n_cameras, radii.shape[1], 2) and depths.shape == radii.shape
+        return None, depths, radii  # stand for the sorted lists
+
+    def rasterize_to_pixels(
+        means2d, conics, colors, opacities, width, height, tile_size, offsets, order, *, backgrounds, packed, absgrad
+    ):
+        pictures = [
+            composite_dense(means2d[k], offsets[k], conics[k], opacities[k], colors[k], order[k], (height, width),
+                            None if backgrounds is None else backgrounds[k])
+            for k in range(len(means2d))
+        ]  # fmt: skip
+        if absgrad and means2d.requires_grad:
+            means2d.register_hook(lambda grad: setattr(means2d, "absgrad", 2 * grad.abs()))
+        return torch.stack([p.features for p in pictures]), torch.stack([p.alpha for p in pictures])
+
+    monkeypatch.setattr(gsplat, "fully_fused_projection", fully_fused_projection)
+    monkeypatch.setattr(gsplat, "isect_tiles", isect_tiles)
+    monkeypatch.setattr(gsplat, "isect_offset_encode", lambda entries, count, *tiles: entries)
+    monkeypatch.setattr(gsplat, "rasterize_to_pixels", rasterize_to_pixels)
+    monkeypatch.setattr(gsplat_backend, "_missing", lambda device: None)
+    monkeypatch.setattr(gsplat_backend, "_gsplat", lambda like: gsplat)  # any dtype
 
 
 def scene(**kwargs):
@@ -127,12 +164,98 @@ def test_a_missing_package_is_named(monkeypatch):
     assert "install gsplat==1.4.0" in gsplat_backend._missing(torch.device("cuda"))
 
 
+@pytest.mark.parametrize("statistics", ["own", "full"])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_prefixes_in_one_batch_equal_separate_pictures(kernels, assert_close, antialiased, statistics):
+    prefixes_equal_separate_pictures(scenes.leaves_of(scenes.splats(n=30), torch.float64), scenes.camera(),
+                                     TorchRasterizer(), assert_close, antialiased, statistics, 2)  # fmt: skip
+
+
+def prefixes_equal_separate_pictures(splats, camera, each, assert_close, antialiased, statistics, absgrad_factor=1):
+    """The batch of `GsplatRasterizer` against a call of `each` per prefix: pictures, gradients, statistics."""
+    level = torch.arange(len(splats), device=splats.means.device) % 3 + 1
+    background = splats.means.new_tensor([0.1, 0.5, 0.9])
+    batch = GsplatRasterizer(absgrad=True).prefixes(
+        splats, level, 3, camera, background=background, antialiased=antialiased, statistics=statistics
+    )
+    torch.stack([(k + 1) * r.features.square().sum() + r.alpha.sum() for k, r in enumerate(batch)]).sum().backward()
+    gradients = {name: getattr(splats, name).grad.clone() for name in scenes.LEAVES}
+    info = batch[-1].info
+    assert info["radii"].shape == (1, len(splats)) and info["means2d"].shape == (1, len(splats), 2)
+    assert info["opacities"].shape == info["depths"].shape == (1, len(splats))
+    for name in scenes.LEAVES:
+        getattr(splats, name).grad = None
+    expected = torch.zeros_like(info["means2d"])
+    for k in range(1, 4):
+        rows = torch.where(level <= k)[0]
+        alone = each(splats.select(rows), camera, background=background, antialiased=antialiased)
+        alone.info["means2d"].retain_grad()
+        (k * alone.features.square().sum() + alone.alpha.sum()).backward()
+        assert_close(batch[k - 1].features, alone.features)
+        assert_close(batch[k - 1].alpha, alone.alpha)
+        counts = level[rows] == k if statistics == "own" else torch.full_like(rows, k == 3, dtype=torch.bool)
+        expected[0, rows[counts]] = alone.info["means2d"].grad[0, counts]
+    assert expected.abs().max() > 0
+    assert_close(info["means2d"].grad, expected)
+    if absgrad_factor != 1:
+        assert_close(info["means2d"].absgrad, absgrad_factor * expected.abs())
+    for name in scenes.LEAVES:
+        assert_close(gradients[name], getattr(splats, name).grad)
+
+
+def test_prefixes_without_gradients_and_without_gaussians(kernels):
+    splats, camera = scenes.splats(n=4), scenes.camera()
+    level = torch.tensor([1, 1, 2, 2])
+    renderings = GsplatRasterizer().prefixes(splats, level, 2, camera)
+    assert not renderings[-1].info["means2d"].requires_grad
+    none = GsplatRasterizer().prefixes(splats.select(level > 2), level[:0], 2, camera)
+    assert len(none) == 2 and not none[0].alpha.any()
+    with pytest.raises(ValueError, match=r"levels run from 1 to 2, outside of 1..1"):
+        GsplatRasterizer().prefixes(splats, level, 1, camera)
+
+
+def test_shapes_are_brought_into_the_kernels_range(fake):
+    splats, camera = scene()
+    splats = scenes.replace(splats, quats=torch.zeros_like(splats.quats), scales=torch.full_like(splats.scales, 1e38))
+    GsplatRasterizer()(splats, camera)
+    splats = scenes.replace(splats, quats=splats.quats + torch.tensor([0, 3e-15, 0, -4e-15]))
+    GsplatRasterizer()(splats, camera)
+    first, second = fake.calls
+    assert (first["quats"] == torch.tensor([1.0, 0, 0, 0])).all()
+    assert (second["quats"] == torch.tensor([0, 0.75, 0, -1])).all()
+    assert first["scales"].max() <= 1e7 * 7 / 40 and first["scales"].min() > 0
+
+
+def test_a_scene_far_from_the_origin_is_moved_to_the_camera(fake):
+    splats, camera = scene()
+    GsplatRasterizer()(splats, camera)
+    far = torch.tensor([2.0**20, -(2.0**21), 2.0**20])
+    moved = camera.viewmat.clone()
+    moved[:3, 3] -= moved[:3, :3] @ far
+    GsplatRasterizer()(scenes.replace(splats, means=splats.means + far), type(camera)(moved, camera.K, 37, 29))
+    near, away = fake.calls
+    assert not away["viewmats"][0, :3, 3].any()
+    assert (away["means"] - near["means"]).abs().max() < 0.2  # a quarter of a unit is float32's step at that distance
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("statistics", ["own", "full"])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_prefixes_in_one_batch_equal_separate_pictures_on_cuda(antialiased, statistics):
+    def close(actual, expected):
+        assert (actual - expected).abs().max() < 1e-4 * expected.abs().max().clamp_min(1)
+
+    base = scenes.splats(n=200, dtype=torch.float32)
+    splats = type(base)(**{k: getattr(base, k).detach().cuda().requires_grad_() for k in scenes.LEAVES})
+    view = scenes.camera(dtype=torch.float32)
+    view = type(view)(view.viewmat.cuda(), view.K.cuda(), view.width, view.height)
+    prefixes_equal_separate_pictures(splats, view, GsplatRasterizer(), close, antialiased, statistics)
+
+
 @pytest.mark.cuda
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("name", ["plain", "off_centre", "rotated", "behind", "finished_pixels", "empty"])
 def test_equals_the_reference_on_cuda(name, antialiased, assert_close):
-    from freqgs_plugin.rendering.torch_backend import TorchRasterizer
-
     splats, camera = scenes.awkward()[name]
     background = torch.tensor([0.1, 0.2, 0.3])
     reference = scenes.leaves_of(splats, torch.float64)
