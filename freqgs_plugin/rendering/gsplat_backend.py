@@ -12,12 +12,10 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
-from freqgs_plugin.functional.projection import QUATERNION_MIN
+from freqgs_plugin.functional.projection import QUATERNION_MIN, STD_MAX
 from freqgs_plugin.rendering.base import BLUR, NEAR_PLANE, Statistics, check_inputs, check_levels
 from freqgs_plugin.types import Camera, Rendering, Splats
 
-STD_MAX = 1e7
-"""px; a tenth of the other rasterizers' limit: the kernels' determinant is a difference in float32"""
 TILE = 16
 """px, side of the kernels' tiles: gsplat's own choice"""
 _INFO_KEYS = ("means2d", "depths", "conics", "opacities", "width", "height", "n_cameras", "gaussian_ids", "camera_ids")
@@ -185,7 +183,11 @@ def _beside_the_camera(
     """Means from the camera's centre, and the view matrix that only turns: the kernels' float32 has no digits left for
     a scene far from the origin, so the centre is subtracted in float64."""
     viewmat = camera.viewmat.to(means.device, torch.float64)
-    centre = -viewmat[:3, 3] @ viewmat[:3, :3]
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3:]
+    # the inverse, not the transpose: a rotation in float32 is orthogonal to seven digits only, and a million units
+    # away that is a tenth of one
+    adjoint = torch.linalg.cross(rotation.roll(-1, 0), rotation.roll(-2, 0))
+    centre = -(translation * adjoint).sum(0) / (rotation[0] * adjoint[0]).sum()
     turn = viewmat.clone()
     turn[:3, 3] = 0
     return (means - centre).to(means.dtype), turn.to(means.dtype)

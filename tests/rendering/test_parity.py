@@ -273,8 +273,10 @@ def test_a_forked_child_gives_the_same_bits():
         child.join()
 
 
-def test_golden_images_are_there():
+def test_golden_images_are_gsplats():
     assert len(GOLDEN) >= 4
+    for path in GOLDEN:
+        assert str(np.load(path)["rasterizer"]).startswith("gsplat, float32 on cuda"), path
 
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda p: p.stem)
@@ -289,11 +291,9 @@ def test_equals_the_recorded_images(rasterizer, path, assert_close):
     rendering = rasterizer(
         splats, view, background=torch.from_numpy(recorded["background"]), antialiased=bool(recorded["antialiased"])
     )
-    # a recording by gsplat lists tiles by a box of 3 standard deviations, not by the ellipse where alpha >= 1/255
-    loosen = 20 if str(recorded["rasterizer"]).startswith("torch") else 2000
-    assert_close(rendering.features, torch.from_numpy(recorded["image"]), loosen=loosen)
-    assert_close(rendering.alpha, torch.from_numpy(recorded["alpha"]), loosen=loosen)
-    assert_close(rendering.depth, torch.from_numpy(recorded["depth"]), loosen=loosen * 5)
+    assert_close(rendering.features, torch.from_numpy(recorded["image"]))
+    assert_close(rendering.alpha, torch.from_numpy(recorded["alpha"]))
+    assert_close(rendering.depth, torch.from_numpy(recorded["depth"]))
 
 
 def test_gradient_of_the_background_is_the_light_left_over():
