@@ -111,10 +111,12 @@ def _lane_centres():
 @njit(error_model="numpy", inline="always")
 def _start_light(scratch, at, tx, ty, width, height):
     """Light 1 inside the image, 'finished' outside of it."""
-    for row in range(TILE):
-        for x in range(TILE):
-            inside = tx * TILE + x < width and ty * TILE + row < height
-            scratch[at + _pixel(x, row)] = _ONE if inside else -_ONE
+    across, down = width - tx * TILE, height - ty * TILE
+    for start in range(0, TILE, STRIP):
+        for row in range(TILE):
+            p = at + _pixel(start, row)
+            for x in range(STRIP):
+                scratch[p + x] = _ONE if start + x < across and row < down else -_ONE
 
 
 @njit(error_model="numpy", inline="always")
@@ -127,13 +129,28 @@ def _unfinished_rows(scratch, prefixes, block):
     """First and last row with an unfinished pixel in any prefix; TILE and -1 if there is none."""
     first, last = TILE, -1
     for row in range(0, TILE, ROWS):
-        brightest = lanes(-_ONE)
+        # the first prefix, of the fewest Gaussians, is nearly always the last to finish
         for k in range(prefixes):
+            brightest = lanes(-_ONE)
             for x in range(0, TILE, STRIP):
                 brightest = maximum(brightest, load(scratch, k * block + LIGHT * PIXELS + _pixel(x, row)))
-        if any_set(brightest > _ZERO):
-            first, last = min(first, row), row + ROWS - 1
+            if any_set(brightest > _ZERO):
+                first, last = min(first, row), row + ROWS - 1
+                break
     return first, last
+
+
+@njit(error_model="numpy", fastmath=_FAST, inline="always")
+def _finish(block, p, count, image, light, depth, background, with_depth, y, c):
+    """Write `count` pixels from p on, of one strip, to row y and columns c and on."""
+    for x in range(count):
+        left_over = abs(block[p + LIGHT * PIXELS + x])
+        image[0, y, c + x] = block[p + F0 * PIXELS + x] + left_over * background[0]
+        image[1, y, c + x] = block[p + F1 * PIXELS + x] + left_over * background[1]
+        image[2, y, c + x] = block[p + F2 * PIXELS + x] + left_over * background[2]
+        light[y, c + x] = left_over
+        if with_depth:
+            depth[y, c + x] = block[p + DEPTH * PIXELS + x]
 
 
 @njit(parallel=True, fastmath=_FAST, error_model="numpy", cache=True)
@@ -189,32 +206,35 @@ def composite(
                 first_row, last_row = _unfinished_rows(scratch, prefixes, FORWARD_BLOCK)
                 if first_row > last_row:
                     break
+        across, down = width - tx * TILE, height - ty * TILE
         for k in range(prefixes):
             block = scratch[k * FORWARD_BLOCK :]
-            for row in range(min(TILE, height - ty * TILE)):
-                for x in range(min(TILE, width - tx * TILE)):
-                    p = _pixel(x, row)
-                    y, c = ty * TILE + row, tx * TILE + x
-                    left_over = abs(block[p + LIGHT * PIXELS])
-                    image[k, 0, y, c] = block[p + F0 * PIXELS] + left_over * background[0]
-                    image[k, 1, y, c] = block[p + F1 * PIXELS] + left_over * background[1]
-                    image[k, 2, y, c] = block[p + F2 * PIXELS] + left_over * background[2]
-                    light[k, y, c] = left_over
-                    if with_depth:
-                        depth[y, c] = block[p + DEPTH * PIXELS]
+            for row in range(min(TILE, down)):
+                y = ty * TILE + row
+                for start in range(0, min(TILE, across), STRIP):
+                    p, c = _pixel(start, row), tx * TILE + start
+                    # a whole strip is a loop of known length, which becomes a few vector instructions
+                    if across - start >= STRIP:
+                        _finish(block, p, STRIP, image[k], light[k], depth, background, with_depth, y, c)
+                    else:
+                        _finish(block, p, across - start, image[k], light[k], depth, background, with_depth, y, c)
 
 
 @njit(error_model="numpy", inline="always")
 def _start_gradient(scratch, at, tx, ty, width, height, image, light, v_image, v_light):
     _start_light(scratch, at + LIGHT * PIXELS, tx, ty, width, height)
+    across = width - tx * TILE
     for row in range(min(TILE, height - ty * TILE)):
-        for x in range(min(TILE, width - tx * TILE)):
-            p = at + _pixel(x, row)
-            y, c = ty * TILE + row, tx * TILE + x
-            g0, g1, g2 = v_image[0, y, c], v_image[1, y, c], v_image[2, y, c]
-            scratch[p + G0 * PIXELS], scratch[p + G1 * PIXELS], scratch[p + G2 * PIXELS] = g0, g1, g2
-            done = g0 * image[0, y, c] + g1 * image[1, y, c] + g2 * image[2, y, c]
-            scratch[p + REST * PIXELS] = done + light[y, c] * v_light[y, c]
+        y = ty * TILE + row
+        for start in range(0, min(TILE, across), STRIP):
+            p, c = at + _pixel(start, row), tx * TILE + start
+            for x in range(min(STRIP, across - start)):
+                g0, g1, g2 = v_image[0, y, c + x], v_image[1, y, c + x], v_image[2, y, c + x]
+                scratch[p + G0 * PIXELS + x] = g0
+                scratch[p + G1 * PIXELS + x] = g1
+                scratch[p + G2 * PIXELS + x] = g2
+                done = g0 * image[0, y, c + x] + g1 * image[1, y, c + x] + g2 * image[2, y, c + x]
+                scratch[p + REST * PIXELS + x] = done + light[y, c + x] * v_light[y, c + x]
 
 
 @njit(parallel=True, fastmath=_FAST, error_model="numpy", cache=True)

@@ -48,7 +48,8 @@ class LevelStrategy(DefaultStrategy):
                 state[key] = torch.zeros_like(norm)
         state["grad2d"] += torch.where(seen, norm, 0.0)
         state["count"] += seen.to(norm.dtype)
-        screen = info["radii"][0].to(norm.dtype) / float(max(info["width"], info["height"]))
+        # by a tensor: CUDA multiplies by the reciprocal of a number, which puts 6 of 120 px over a threshold of 0.05
+        screen = info["radii"][0].to(norm.dtype) / size.max()
         state["radii"] = torch.maximum(state["radii"], torch.where(seen, screen, 0.0))
 
     def step(
