@@ -220,7 +220,7 @@ def budget_result(margins, ours=27.0, plain=27.0, counts=(70, 100)):
     for share, margin in zip(budget.SHARES, margins, strict=True):
         row = {"share": share, "count": 100 * share, "scale": 2.0}
         row |= {name: {"psnr": 20.0 + margin} for name in budget.OURS}
-        row |= {name: {"psnr": 20.0 - i} for i, name in enumerate(budget.OTHERS)}
+        row |= {name: {"psnr": 20.0 - i} for i, name in enumerate((*budget.OTHERS, *budget.BESIDES))}
         rows.append(row)
     full = {
         name: {"gaussians": n, "psnr": p, "ssim": 0.9}
@@ -256,7 +256,7 @@ def test_equal_counts_are_equal_and_full_detail_is_full():
     clod, plain = decaying_run(), decaying_run(None, n=50)
     found = as_json(budget.compare(clod, plain, 5.0))
     for row in found["shares"]:
-        for name in (*budget.OURS, *budget.OTHERS):
+        for name in (*budget.OURS, *budget.OTHERS, *budget.BESIDES):
             assert row[name]["drawn"] == pytest.approx(row["count"]), (row["share"], name)
     assert found["full"]["plain"]["drawn"] == 50 and found["full"]["clod"]["gaussians"] == 60
     scales = [row["scale"] for row in found["shares"]]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from freqgs_plugin.functional.budget import DecayBudget, decay_scale, in_view
+from freqgs_plugin.functional.budget import DecayBudget, LevelBudget, decay_scale, in_view
 from freqgs_plugin.reports.bench.tables import BenchTable, Row
 from freqgs_plugin.reports.drawing import HeldOutView
 from freqgs_plugin.reports.experiments.goals import Goal
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 SHARES = (1.0, 0.75, 0.5, 0.35, 0.25, 0.15, 0.1)
 OURS = {"s_v": "clodsplat", "held": "clodsplat, s_v at most s_max"}
 OTHERS = {"opacity": "plain, most opaque", "shared": "plain, shared sigma", "chosen": "plain, chosen by shared sigma"}
+BESIDES = {"shows": "plain, those that show most"}
+"""drawn for comparison; no goal asks for it"""
 DECAYS = (1.25, 5.0, 20.0, 80.0, 320.0)
 """shared sigmas that are tried; the best one counts"""
 GAIN_AT, GAIN = 0.25, 1.0
@@ -44,7 +46,9 @@ same number of Gaussians of that view.
   sigmas (1.25 to 320) the one with the best PSNR on these views counts, at each share anew. The larger it is, the
   less distance matters: with the largest one it is *most opaque*, hardly dimmed.
 * *plain, chosen by shared sigma*: Gaussians that are chosen so, with their own opacities; at small counts the formula
-  dims the picture."""
+  dims the picture.
+* *plain, those that show most*: by opacity times area on the screen, which is how *s_v at most s_max* chooses beyond
+  s_max. It tells how much of that row's gain is the choice, and how much the training."""
 
 
 def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
@@ -53,7 +57,7 @@ def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
     return lab.step(
         "budget",
         [clod, plain],
-        {"shares": SHARES, "decays": DECAYS},
+        {"shares": SHARES, "decays": DECAYS, "ways": [*OURS, *OTHERS, *BESIDES]},
         lambda: compare(lab.run(clod), lab.run(plain), DEFAULT_SCALE),
     )
 
@@ -86,7 +90,8 @@ def _at_share(
     free = [DecayBudget(count, scene_distance=distance) for count in counts]
     held = [DecayBudget(count, scene_distance=distance, largest=largest) for count in counts]
     opaque = [MostOpaque(count) for count in counts]
-    ways = {"s_v": (clod, free), "held": (clod, held), "opacity": (plain, opaque)}
+    most_shown = [LevelBudget(count, soft=False) for count in counts]
+    ways = {"s_v": (clod, free), "held": (clod, held), "opacity": (plain, opaque), "shows": (plain, most_shown)}
     measured = {name: asdict(quality(run, views, each.__getitem__)) for name, (run, each) in ways.items()}
     for name, fade in (("shared", True), ("chosen", False)):
         tried = []
@@ -108,7 +113,7 @@ def tables(scene: str, results: Results) -> list[BenchTable]:
     rows: list[Row] = [
         {"share": share, "seeds": [result["shares"][i] for result in results]} for i, share in enumerate(SHARES)
     ]
-    names = {**OURS, **OTHERS}
+    names = {**OURS, **OTHERS, **BESIDES}
     by_share = BenchTable(
         f"clod-budget-{scene}",
         f"{scene}: PSNR at equal counts, dB",
@@ -122,7 +127,8 @@ def tables(scene: str, results: Results) -> list[BenchTable]:
             ("margin", lambda row: shown(row["seeds"], lambda s: margin(s, "s_v"), "+.2f")),
             ("margin, s_v at most s_max", lambda row: shown(row["seeds"], lambda s: margin(s, "held"), "+.2f")),
         ],
-        "Gaussians and s_v (of *clodsplat*) are means over views. *Margin*: above the best of the plain columns.",
+        "Gaussians and s_v (of *clodsplat*) are means over views. *Margin*: above the best of the first three plain "
+        "columns.",
     )
     full: list[Row] = [
         {"model": name, "seeds": [result["full"][name] for result in results]} for name in ("plain", "clod")
@@ -174,8 +180,15 @@ def full_detail_goal(scene: str, results: Results) -> Goal:
 def figures(scene: str, results: Results) -> "dict[str, Figure]":
     """PSNR by share for all ways to choose."""
     figure, axes = panels(1, width=7.5, height=4.4)
-    colours = {"s_v": COLOURS[0], "held": COLOURS[1], "opacity": COLOURS[6], "shared": GREY, "chosen": COLOURS[4]}
-    for name, title in {**OURS, **OTHERS}.items():
+    colours = {
+        "s_v": COLOURS[0],
+        "held": COLOURS[1],
+        "opacity": COLOURS[6],
+        "shared": GREY,
+        "chosen": COLOURS[4],
+        "shows": COLOURS[2],
+    }
+    for name, title in {**OURS, **OTHERS, **BESIDES}.items():
         y = [mean([r["shares"][i] for r in results], lambda s, n=name: s[n]["psnr"]) for i in range(len(SHARES))]
         dashed = "-" if name in OURS else "--"
         axes[0].plot([100 * s for s in SHARES], y, color=colours[name], marker="o", ms=4, ls=dashed, label=title)
