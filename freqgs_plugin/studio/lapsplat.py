@@ -59,12 +59,14 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """weight of the mean opacity of what a view shows: Gaussians that it does not need fade and are pruned (ours)"""
     size_penalty: float = 0.01
     """weight of the mean standard deviation of what a view shows, world units; 0: none (ours)"""
-    densify_grad_thresh: float = 0.0004
+    densify_grad_thresh: float = 0.0006
     """2D gradient, in units of half the image, above which a Gaussian grows (ours; splatfacto: 0.0008)"""
+    split_screen_size: float = 0.03
+    """radius on the screen, as a share of the longer side, above which a Gaussian is split (ours; splatfacto: 0.05)"""
     coarse_growth_factor: float = 1.8
     """densification threshold is multiplied by this for each level below the finest (ours; the paper: 1)"""
-    lower_cull_alpha_thresh: float = 0.1
-    """opacity under which Gaussians of levels below the newest are pruned (the paper: as the newest)"""
+    lower_cull_alpha_thresh: float = 0.22
+    """opacity under which Gaussians of levels below the newest are pruned (ours; the paper: 0.1, as the newest)"""
     reset_levels: Literal["all", "newest"] = "all"
     """whose opacities are reset: all levels' (the paper) or only the newest's (ours)"""
     restart_schedulers: bool = True

@@ -16,6 +16,7 @@ DEFAULT_SCALE = 5.0
 PLAIN: Mapping[str, Value] = {
     "num_levels": 1,
     "densify_grad_thresh": 0.0008,
+    "split_screen_size": 0.05,
     "dropout": 0.0,
     "opacity_penalty": 0.0,
     "size_penalty": 0.0,
