@@ -14,7 +14,7 @@ from rich.console import Console
 
 from freqgs_plugin import cli
 from freqgs_plugin.rendering.base import PrefixRasterizer, get_rasterizer
-from freqgs_plugin.reports.bench import runner
+from freqgs_plugin.reports.bench import cuda, raster, runner
 from freqgs_plugin.reports.bench.fit import asymptotic, fit
 from freqgs_plugin.reports.bench.memory import peak_mib
 from freqgs_plugin.reports.bench.options import BenchError, BenchOptions
@@ -290,6 +290,24 @@ def test_raster_from_the_command_line(tmp_path, capsys):
     assert decays == sorted(decays, reverse=True) and decays[-1] < 0.5
     assert page.read_text().count("| --- |") == 3
     assert "Rasterizers" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_the_cuda_bench_needs_a_device(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["bench", "cuda"])
+    assert "needs a CUDA device" in capsys.readouterr().err
+
+
+def test_the_cuda_table_holds_errors_beside_times():
+    options, steps = BenchOptions(quick=True, rounds=1), []
+    rows = cuda.with_errors(
+        raster.backend_rows("medium", [("torch", "cpu"), ("numba", "cpu")], options, steps.append), options
+    )
+    assert len(steps) == 3 and [row["backend"] for row in rows] == ["torch, cpu", "numba, cpu"]
+    assert rows[0]["forward_ratio"] == 1 and all(60 < row["errors"].psnr < 200 for row in rows)
+    text = cuda.cuda_table(rows).markdown()
+    assert "PSNR, dB" in text and "opacities" in text and text.count("medium") == 2
 
 
 def test_prefixes_of_the_bench_agree_with_a_call_for_each():

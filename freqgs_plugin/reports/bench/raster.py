@@ -12,7 +12,7 @@ from freqgs_plugin.rendering.render import render
 from freqgs_plugin.reports.bench.memory import peak_memory
 from freqgs_plugin.reports.bench.options import BenchOptions
 from freqgs_plugin.reports.bench.runner import Bench, Measured, Tick
-from freqgs_plugin.reports.bench.tables import BenchTable, Row, milliseconds, number, ratio
+from freqgs_plugin.reports.bench.tables import BenchTable, Column, Row, milliseconds, number, ratio
 from freqgs_plugin.reports.bench.workloads import (
     DETAIL_SEED,
     IMAGE_SEED,
@@ -29,7 +29,6 @@ from freqgs_plugin.reports.bench.workloads import (
 from freqgs_plugin.reports.timing import interleaved
 from freqgs_plugin.types import Splats
 
-BASELINE = "torch, cpu"
 PREFIX_COUNTS = (3, 5)
 PREFIX_WORKLOADS = ("medium", "large")
 SHARE_SCALES = (1.0, 2.0, 5.0)
@@ -60,7 +59,8 @@ def backends() -> list[tuple[str, str]]:
 
 
 def backend_rows(name: str, contenders: list[tuple[str, str]], options: BenchOptions, tick: Tick) -> list[Row]:
-    """Times, ratios to the baseline, and peak memory on one workload."""
+    """Times, ratios to the first of `contenders` (rasterizer, device), and peak memory on one workload."""
+    baseline = ", ".join(contenders[0])
     memory: dict[str, Any] = {}
     forward: dict[str, Callable[[], object]] = {}
     both: dict[str, Callable[[], object]] = {}
@@ -80,39 +80,46 @@ def backend_rows(name: str, contenders: list[tuple[str, str]], options: BenchOpt
             "backend": label,
             "forward": drawn[label],
             "forward_backward": differentiated[label],
-            "forward_ratio": ratio(drawn[label], drawn[BASELINE]),
-            "forward_backward_ratio": ratio(differentiated[label], differentiated[BASELINE]),
+            "forward_ratio": ratio(drawn[label], drawn[baseline]),
+            "forward_backward_ratio": ratio(differentiated[label], differentiated[baseline]),
             "memory_mib": memory[label],
         }
         for label in forward
     ]
 
 
-def backend_table(rows: list[Row]) -> BenchTable:
+def backend_columns() -> list[Column]:
+    """Of `backend_rows`: times, ratios and memory."""
+
     def memory(row: Row, which: str) -> str:
         return number(row["memory_mib"].get(which))
 
+    return [
+        ("workload", lambda row: row["workload"]),
+        ("backend", lambda row: row["backend"]),
+        ("forward, ms", lambda row: milliseconds(row["forward"])),
+        ("both, ms", lambda row: milliseconds(row["forward_backward"])),
+        ("forward / torch", lambda row: number(row["forward_ratio"])),
+        ("both / torch", lambda row: number(row["forward_backward_ratio"])),
+        ("forward, MiB", lambda row: memory(row, "forward")),
+        ("both, MiB", lambda row: memory(row, "forward_backward")),
+    ]
+
+
+def backend_note(rows: Sequence[Row]) -> str:
+    """What the columns of `backend_columns` mean, and why a memory figure is missing."""
     failed = [f"{row['backend']}: {row['memory_mib']['error']}" for row in rows if "error" in row["memory_mib"]]
-    return BenchTable(
-        "raster",
-        "Rasterizers",
-        rows,
-        [
-            ("workload", lambda row: row["workload"]),
-            ("backend", lambda row: row["backend"]),
-            ("forward, ms", lambda row: milliseconds(row["forward"])),
-            ("both, ms", lambda row: milliseconds(row["forward_backward"])),
-            ("forward / torch", lambda row: number(row["forward_ratio"])),
-            ("both / torch", lambda row: number(row["forward_backward_ratio"])),
-            ("forward, MiB", lambda row: memory(row, "forward")),
-            ("both, MiB", lambda row: memory(row, "forward_backward")),
-        ],
+    return (
         f"{sizes_of(rows)} *Both*: forward and backward. Times: medians (quartiles). Colours are given: no harmonics "
         "are evaluated. Gradients: of all five tensors of the "
         "splats, without absolute gradients. Memory: what the process holds at most above what it held before, each in "
         "a process of its own; on CUDA, torch's allocator."
-        + "".join(f" No memory figure for {reason}." for reason in failed),
+        + "".join(f" No memory figure for {reason}." for reason in failed)
     )
+
+
+def backend_table(rows: list[Row]) -> BenchTable:
+    return BenchTable("raster", "Rasterizers", rows, backend_columns(), backend_note(rows))
 
 
 def sizes_of(rows: Sequence[Row]) -> str:
