@@ -127,18 +127,8 @@ class GsplatRasterizer:
             packed=False,
             absgrad=self.absgrad,
         )
-        info = {
-            "means2d": _collected(centres, level if statistics == "own" else None, self.absgrad),
-            "radii": _larger_radii(radii),
-            "depths": depths,
-            "conics": conics,
-            "opacities": opacities,
-            "width": camera.width,
-            "height": camera.height,
-            "n_cameras": 1,
-            "gaussian_ids": None,
-            "camera_ids": None,
-        }
+        collected = _collected(centres, level if statistics == "own" else None, self.absgrad)
+        info = _info(collected, _larger_radii(radii), depths, conics, opacities, camera)
         no_depth = torch.zeros_like(alpha[0])
         return [Rendering(image[k], alpha[k], no_depth, info) for k in range(num_levels)]
 
@@ -247,20 +237,29 @@ def _missing(device: torch.device) -> str | None:
     return None
 
 
-def _empty(splats: Splats, camera: Camera, background: Float[Tensor, " d"] | None) -> Rendering:
-    """The picture of nothing: the kernels are not made for it."""
-    zero = splats.means.new_zeros(camera.height, camera.width, 1)
-    features = zero.expand(-1, -1, splats.features.shape[1])
-    info = {
-        "means2d": splats.means[None, :, :2],
-        "radii": torch.zeros(1, 0, dtype=torch.int32, device=zero.device),
-        "depths": splats.means[None, :, 2],
-        "conics": splats.means[None],
-        "opacities": splats.opacities[None],
+def _info(
+    means2d: Tensor, radii: Tensor, depths: Tensor, conics: Tensor, opacities: Tensor, camera: Camera
+) -> dict[str, Any]:
+    """What `gsplat.rasterization` would report of one camera."""
+    return {
+        "means2d": means2d,
+        "radii": radii,
+        "depths": depths,
+        "conics": conics,
+        "opacities": opacities,
         "width": camera.width,
         "height": camera.height,
         "n_cameras": 1,
         "gaussian_ids": None,
         "camera_ids": None,
     }
+
+
+def _empty(splats: Splats, camera: Camera, background: Float[Tensor, " d"] | None) -> Rendering:
+    """The picture of nothing: the kernels are not made for it."""
+    zero = splats.means.new_zeros(camera.height, camera.width, 1)
+    features = zero.expand(-1, -1, splats.features.shape[1])
+    radii = torch.zeros(1, 0, dtype=torch.int32, device=zero.device)
+    depths, opacities = splats.means[None, :, 2], splats.opacities[None]
+    info = _info(splats.means[None, :, :2], radii, depths, splats.means[None], opacities, camera)
     return Rendering(features if background is None else features + background, zero, zero, info)

@@ -75,7 +75,7 @@ def kernels(monkeypatch):
             for k in range(len(means2d))
         ]  # fmt: skip
         if absgrad and means2d.requires_grad:
-            means2d.register_hook(lambda grad: setattr(means2d, "absgrad", 2 * grad.abs()))
+            means2d.register_hook(lambda _: setattr(means2d, "absgrad", torch.stack([p.absgrad for p in pictures])))
         return torch.stack([p.features for p in pictures]), torch.stack([p.alpha for p in pictures])
 
     monkeypatch.setattr(gsplat, "fully_fused_projection", fully_fused_projection)
@@ -168,10 +168,10 @@ def test_a_missing_package_is_named(monkeypatch):
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_prefixes_in_one_batch_equal_separate_pictures(kernels, assert_close, antialiased, statistics):
     prefixes_equal_separate_pictures(scenes.leaves_of(scenes.splats(n=30), torch.float64), scenes.camera(),
-                                     TorchRasterizer(), assert_close, antialiased, statistics, 2)  # fmt: skip
+                                     TorchRasterizer(), assert_close, antialiased, statistics)  # fmt: skip
 
 
-def prefixes_equal_separate_pictures(splats, camera, each, assert_close, antialiased, statistics, absgrad_factor=1):
+def prefixes_equal_separate_pictures(splats, camera, each, assert_close, antialiased, statistics):
     """The batch of `GsplatRasterizer` against a call of `each` per prefix: pictures, gradients, statistics."""
     level = torch.arange(len(splats), device=splats.means.device) % 3 + 1
     background = splats.means.new_tensor([0.1, 0.5, 0.9])
@@ -185,7 +185,7 @@ def prefixes_equal_separate_pictures(splats, camera, each, assert_close, antiali
     assert info["opacities"].shape == info["depths"].shape == (1, len(splats))
     for name in scenes.LEAVES:
         getattr(splats, name).grad = None
-    expected = torch.zeros_like(info["means2d"])
+    expected, absolute = torch.zeros_like(info["means2d"]), torch.zeros_like(info["means2d"])
     for k in range(1, 4):
         rows = torch.where(level <= k)[0]
         alone = each(splats.select(rows), camera, background=background, antialiased=antialiased)
@@ -195,10 +195,10 @@ def prefixes_equal_separate_pictures(splats, camera, each, assert_close, antiali
         assert_close(batch[k - 1].alpha, alone.alpha)
         counts = level[rows] == k if statistics == "own" else torch.full_like(rows, k == 3, dtype=torch.bool)
         expected[0, rows[counts]] = alone.info["means2d"].grad[0, counts]
-    assert expected.abs().max() > 0
+        absolute[0, rows[counts]] = alone.info["means2d"].absgrad[0, counts]
+    assert expected.abs().max() > 0 and absolute.sum() > 1.1 * expected.abs().sum()
     assert_close(info["means2d"].grad, expected)
-    if absgrad_factor != 1:
-        assert_close(info["means2d"].absgrad, absgrad_factor * expected.abs())
+    assert_close(info["means2d"].absgrad, absolute)
     for name in scenes.LEAVES:
         assert_close(gradients[name], getattr(splats, name).grad)
 
