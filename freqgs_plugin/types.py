@@ -26,8 +26,10 @@ class Gaussians:
     """standard deviations along the rotated axes, world units"""
     opacities: Float[Tensor, " n"]
     """in [0, 1]"""
-    sh: Float[Tensor, "n k 3"]
-    """spherical-harmonic coefficients of the colour, k = (degree + 1)^2"""
+    features_dc: Float[Tensor, "n 3"]
+    """spherical-harmonic coefficients of the colour, degree 0"""
+    features_rest: Float[Tensor, "n k 3"]
+    """the others, k = (degree + 1)^2 - 1: apart, as they are trained, because joining them copies all of them"""
     level: Int[Tensor, " n"]
     """Laplacian-pyramid level, 1..L"""
     signed_residuals: bool = True
@@ -46,7 +48,8 @@ class Gaussians:
             quats=self.quats.index_select(0, rows),
             scales=self.scales.index_select(0, rows),
             opacities=self.opacities.index_select(0, rows),
-            sh=self.sh.index_select(0, rows),
+            features_dc=self.features_dc.index_select(0, rows),
+            features_rest=self.features_rest.index_select(0, rows),
             level=self.level.index_select(0, rows),
             signed_residuals=self.signed_residuals,
             decay=None if self.decay is None else self.decay.index_select(0, rows),

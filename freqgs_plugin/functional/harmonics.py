@@ -1,5 +1,7 @@
 """Real spherical harmonics up to degree 4, in the sign convention of 3D Gaussian splatting, and colours from them."""
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -59,38 +61,50 @@ def basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]
     return torch.stack(out, -1)
 
 
-def evaluate(sh: Float[Tensor, "n k 3"], offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Harmonics with coefficients `sh` in the direction of `offsets` (any length; at length 0 the direction is 0)."""
-    degree = round(sh.shape[1] ** 0.5) - 1
+def evaluate(
+    dc: Float[Tensor, "n 3"], rest: Float[Tensor, "n k 3"], offsets: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Harmonics in the direction of `offsets` (any length; at length 0 the direction is 0).
+
+    `dc` is the coefficient of degree 0, `rest` are the (degree + 1)^2 - 1 others.
+    """
+    degree = _degree(rest)
     if degree == 0:
-        return C0 * sh[:, 0]
-    if sh.device.type == "cpu" and sh.dtype == offsets.dtype == torch.float32 and degree <= 3:
+        # adds 0, and gives a parameter that `rest` is a slice of its gradient, 0: optimizers count its steps from there
+        return C0 * dc + rest.sum(1)
+    if dc.device.type == "cpu" and dc.dtype == rest.dtype == offsets.dtype == torch.float32 and degree <= 3:
         from freqgs_plugin.functional.compiled_harmonics import CompiledHarmonics
 
-        return CompiledHarmonics.apply(sh, offsets)
-    return evaluate_in_torch(sh, offsets)
+        return CompiledHarmonics.apply(dc, rest, offsets)
+    return evaluate_in_torch(dc, rest, offsets)
 
 
-def evaluate_in_torch(sh: Float[Tensor, "n k 3"], offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+def evaluate_in_torch(
+    dc: Float[Tensor, "n 3"], rest: Float[Tensor, "n k 3"], offsets: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
     """`evaluate` on any device and in any dtype."""
-    degree = round(sh.shape[1] ** 0.5) - 1
     # squares of far offsets overflow in float32
     directions = torch.nn.functional.normalize(offsets.to(working_dtype(offsets)), dim=-1).to(offsets)
-    return (basis(directions, degree)[:, :, None] * sh).sum(1)
+    return C0 * dc + (basis(directions, _degree(rest))[:, 1:, None] * rest).sum(1)
+
+
+def _degree(rest: Float[Tensor, "n k 3"]) -> int:
+    return math.isqrt(rest.shape[1] + 1) - 1
 
 
 def level_colours(
-    sh: Float[Tensor, "n k 3"],
+    dc: Float[Tensor, "n 3"],
+    rest: Float[Tensor, "n k 3"],
     offsets: Float[Tensor, "n 3"],
     level: Int[Tensor, " n"],
     signed_residuals: bool,
 ) -> Float[Tensor, "n 3"]:
     """Colours of the Laplacian-pyramid paper: clamp_min(SH + 0.5, 0) (Eq. 3); above level 1 twice that minus 1 (Eq. 4).
 
-    With `signed_residuals` False, Eq. 3 for every level. Eq. 4's range is [-1, inf): the paper names [-1, 1], its code
-    does not clamp from above.
+    `dc`, `rest` and `offsets` as for `evaluate`. With `signed_residuals` False, Eq. 3 for every level. Eq. 4's range is
+    [-1, inf): the paper names [-1, 1], its code does not clamp from above.
     """
-    colour = torch.clamp_min(evaluate(sh, offsets) + 0.5, 0.0)
+    colour = torch.clamp_min(evaluate(dc, rest, offsets) + 0.5, 0.0)
     if not signed_residuals:
         return colour
     residual = (level > 1)[:, None].to(colour.dtype)

@@ -83,7 +83,7 @@ class _Composite(torch.autograd.Function):
         for number, group in enumerate(_feature_groups(features)):
             image = torch.empty(view.prefixes, _CHANNELS, view.height, view.width)
             composite(
-                *view.lists[:3], view.splats, _array(depths), view.level, view.prefixes, group,
+                *view.lists[:2], view.splats, _array(depths), view.level, view.prefixes, group,
                 backgrounds[number][0], with_depth and number == 0, view.width, view.height,
                 image.numpy(), light.numpy(), depth.numpy(),
             )  # fmt: skip
@@ -98,9 +98,9 @@ class _Composite(torch.autograd.Function):
     def backward(ctx, v_planes, v_light, _v_depth):
         means, quats, scales, opacities, features, light, *images = ctx.saved_tensors
         view: _View = ctx.view
-        offsets, ids, boxes, slots, first, count = view.lists
+        offsets, entries, first, count = view.lists
         n, d = features.shape
-        partial = torch.empty(len(ids), V_COLUMNS)
+        partial = torch.empty(len(entries) * V_COLUMNS)
         moves, wants_pose = any(ctx.needs_input_grad[:4]) or ctx.needs_input_grad[6], ctx.needs_input_grad[6]
         total, v_feature_groups = {}, []
         for number, group in enumerate(_feature_groups(features)):
@@ -109,7 +109,7 @@ class _Composite(torch.autograd.Function):
             if missing:
                 v_image = torch.nn.functional.pad(v_image, (0, 0, 0, 0, 0, missing))
             composite_backward(
-                offsets, ids, boxes, slots, view.splats, view.level, view.prefixes, view.own, group,
+                offsets, entries, view.splats, view.level, view.prefixes, view.own, group,
                 view.width, view.height, images[number].numpy(), light.numpy(), _array(v_image),
                 _array(v_light if number == 0 else torch.zeros_like(v_light)), partial.numpy(),
             )  # fmt: skip
@@ -118,7 +118,7 @@ class _Composite(torch.autograd.Function):
             out["view"] = torch.zeros(n if wants_pose else 0, 12)
             project_backward(
                 _array(means), _array(quats), _array(scales), _array(opacities), view.pose, view.intrinsics,
-                view.width, view.height, view.blur, view.antialiased, moves, first, count, partial.numpy(),
+                view.width, view.height, view.blur, view.antialiased, moves, view.splats, first, count, partial.numpy(),
                 out["means"].numpy(), out["quats"].numpy(), out["scales"].numpy(), out["opacity"].numpy()[:, 0],
                 out["features"].numpy(), out["xy"].numpy(), out["abs"].numpy(), out["view"].numpy(),
             )  # fmt: skip

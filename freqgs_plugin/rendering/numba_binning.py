@@ -9,11 +9,13 @@ import math
 import numpy as np
 
 from freqgs_plugin.functional.numba_threads import njit, prange
-from freqgs_plugin.rendering.base import ALPHA_MIN, MAX_ENTRIES
+from freqgs_plugin.rendering.base import MAX_ENTRIES
 from freqgs_plugin.rendering.numba_projection import OPACITY, REACH_X, REACH_Y, S, U, V, X, Y
 
 TILE = 16
 STRIP = 8
+# columns of an entry of the tile lists
+ID, BOX, SLOT = range(3)
 _RADIX_BITS = 11
 _SLACK = 1e-3
 """px by which spans are widened, so that rounding never drops a pixel at ALPHA_MIN"""
@@ -47,15 +49,17 @@ def depth_order(depths, splats):
 
 
 @njit(error_model="numpy", inline="always")
-def _x_span(slope, extreme, sheared, rx, ry, low, high):
+def _x_span(slope, extreme, sheared, rx, ry, inverse_ry, low, high):
     """Least and greatest dx on the ellipse between rows dy = low and high (both within or nearest to it).
 
     At offset dy the ellipse is `sheared` * sqrt(1 - (dy / ry)^2) px to either side of the line dx = slope dy; dx is
     greatest at dy = extreme.
     """
+    if low <= -abs(extreme) and abs(extreme) <= high:
+        return -rx, rx
     low, high = min(max(low, -ry), ry), min(max(high, -ry), ry)
-    low_half = sheared * math.sqrt(max(0.0, 1.0 - (low / ry) * (low / ry)))
-    high_half = sheared * math.sqrt(max(0.0, 1.0 - (high / ry) * (high / ry)))
+    low_half = sheared * math.sqrt(max(0.0, 1.0 - (low * inverse_ry) * (low * inverse_ry)))
+    high_half = sheared * math.sqrt(max(0.0, 1.0 - (high * inverse_ry) * (high * inverse_ry)))
     greatest = max(slope * low + low_half, slope * high + high_half)
     least = min(slope * low - low_half, slope * high - high_half)
     if low <= extreme <= high:
@@ -70,65 +74,65 @@ def tile_lists(order, splats, width, height, num_rows, bands):
     """Tile lists of the Gaussians in `order`, made in `bands` parallel parts.
 
     Returns:
-        offsets [tiles + 1] into the lists; ids [entries] Gaussian rows; boxes [entries]: first row, last row, first and
-        last strip within the tile, 4 + 4 + 4 + 4 bits; slots [entries] where a Gaussian's entries are contiguous; first
-        and count [num_rows] of each Gaussian's slots. Where there would be more than MAX_ENTRIES, offsets [1] is
-        their number, and no list is made.
+        offsets [tiles + 1] into the lists; entries [entries, 3]: the Gaussian's row, its box in the tile (first row,
+        last row, first and last strip, 4 bits each), its slot; first and count [num_rows] of each Gaussian's slots,
+        which follow each other by row. Where there would be more than MAX_ENTRIES, the last offset is their number, and
+        no list is made.
     """
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     n = order.shape[0]
-    row_first = np.zeros(n, np.int32)
+    # rows of pixels, and where a Gaussian's rows of tiles begin in `spans`
+    bottom, top = np.zeros(n, np.int32), np.full(n, -1, np.int32)
     row_start = np.zeros(n + 1, np.int64)
     for k in range(n):
         i = order[k]
-        low = max(math.ceil(splats[i, Y] - splats[i, REACH_Y] - 0.5 - _SLACK), 0.0)
-        high = min(math.floor(splats[i, Y] + splats[i, REACH_Y] - 0.5 + _SLACK), height - 1.0)
+        low = max(np.ceil(splats[i, Y] - splats[i, REACH_Y] - 0.5 - _SLACK), 0.0)
+        high = min(np.floor(splats[i, Y] + splats[i, REACH_Y] - 0.5 + _SLACK), height - 1.0)
         rows = 0
         if low <= high:
-            row_first[k] = int(low) // TILE
-            rows = int(high) // TILE - row_first[k] + 1
+            bottom[k], top[k] = int(low), int(high)
+            rows = top[k] // TILE - bottom[k] // TILE + 1
         row_start[k + 1] = row_start[k] + rows
 
     # columns of pixels per Gaussian and row of tiles
     spans = np.empty((row_start[n], 2), np.int32)
-    entries = np.zeros(n + 1, np.int64)
+    count = np.zeros(num_rows, np.int32)
     for k in prange(n):
         i = order[k]
         x, y = np.float64(splats[i, X]), np.float64(splats[i, Y])
         u, s, v = np.float64(splats[i, U]), np.float64(splats[i, S]), np.float64(splats[i, V])
         rx, ry = np.float64(splats[i, REACH_X]) + 1e-30, np.float64(splats[i, REACH_Y]) + 1e-30
-        sheared = math.sqrt(math.log(splats[i, OPACITY] / ALPHA_MIN)) / u
-        slope, extreme = -s / u, -u * s / (v + s * s) * rx
+        # alpha = ALPHA_MIN where (U dx + S dy)^2 + V dy^2 = V ry^2
+        sheared = math.sqrt(v) * ry / u
+        slope, extreme, inverse_ry = -s / u, -u * s / (v + s * s) * rx, 1.0 / ry
         total = 0
         for r in range(row_start[k], row_start[k + 1]):
-            top = (row_first[k] + r - row_start[k]) * TILE + 0.5 - y
-            least, greatest = _x_span(slope, extreme, sheared, rx, ry, top, top + TILE - 1.0)
-            low = max(math.ceil(x + least - 0.5 - _SLACK), 0.0)
-            high = min(math.floor(x + greatest - 0.5 + _SLACK), width - 1.0)
+            first_row = (bottom[k] // TILE + r - row_start[k]) * TILE + 0.5 - y
+            least, greatest = _x_span(slope, extreme, sheared, rx, ry, inverse_ry, first_row, first_row + TILE - 1.0)
+            low = max(np.ceil(x + least - 0.5 - _SLACK), 0.0)
+            high = min(np.floor(x + greatest - 0.5 + _SLACK), width - 1.0)
             spans[r, 0], spans[r, 1] = 0, -1
             if low <= high:
                 spans[r, 0], spans[r, 1] = int(low), int(high)
-                total += int(high) // TILE - int(low) // TILE + 1
-        entries[k + 1] = total
-    for k in range(n):
-        entries[k + 1] += entries[k]
+                total += spans[r, 1] // TILE - spans[r, 0] // TILE + 1
+        count[i] = total
+    first = np.zeros(num_rows, np.int64)
+    length = 0
+    for i in range(num_rows):
+        first[i] = length
+        length += count[i]
 
-    first, count = np.zeros(num_rows, np.int64), np.zeros(num_rows, np.int32)
-    for k in range(n):
-        first[order[k]] = entries[k]
-        count[order[k]] = entries[k + 1] - entries[k]
-
-    if entries[n] > MAX_ENTRIES:
-        none = np.empty(0, np.int64)
-        return entries[n:], np.empty(0, np.int32), np.empty(0, np.uint16), none, first, count
+    offsets = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    if length > MAX_ENTRIES:
+        offsets[-1] = length
+        return offsets, np.empty((0, 3), np.int32), first, count
 
     # threads take bands of tile rows: each list is filled by one thread, in depth order
     bands = min(bands, tiles_y)
-    offsets = np.zeros(tiles_x * tiles_y + 1, np.int64)
     for band in prange(bands):
         low, high = band * tiles_y // bands, (band + 1) * tiles_y // bands
         for k in range(n):
-            begin = row_first[k]
+            begin = bottom[k] // TILE
             for ty in range(max(begin, low), min(begin + row_start[k + 1] - row_start[k], high)):
                 r = row_start[k] + ty - begin
                 if spans[r, 0] <= spans[r, 1]:
@@ -138,20 +142,17 @@ def tile_lists(order, splats, width, height, num_rows, bands):
         offsets[t + 1] += offsets[t]
 
     cursor = offsets[:-1].copy()
-    ids = np.empty(entries[n], np.int32)
-    slots = np.empty(entries[n], np.int64)
-    boxes = np.empty(entries[n], np.uint16)
+    # one array: with three, the writes to hundreds of lists at a time would not stay in the first-level cache
+    entries = np.empty((length, 3), np.int32)
     for band in prange(bands):
         low, high = band * tiles_y // bands, (band + 1) * tiles_y // bands
         for k in range(n):
-            i = order[k]
-            begin = row_first[k]
+            begin = bottom[k] // TILE
             end = begin + row_start[k + 1] - row_start[k]
             if end <= low or begin >= high:
                 continue
-            slot = entries[k]
-            bottom = math.ceil(splats[i, Y] - splats[i, REACH_Y] - 0.5 - _SLACK)
-            top = math.floor(splats[i, Y] + splats[i, REACH_Y] - 0.5 + _SLACK)
+            i = order[k]
+            slot = first[i]
             for ty in range(begin, end):
                 r = row_start[k] + ty - begin
                 if spans[r, 0] > spans[r, 1]:
@@ -159,15 +160,14 @@ def tile_lists(order, splats, width, height, num_rows, bands):
                 if ty < low or ty >= high:
                     slot += spans[r, 1] // TILE - spans[r, 0] // TILE + 1
                     continue
-                row_low = int(max(bottom - ty * TILE, 0.0))
-                row_high = int(min(top - ty * TILE, TILE - 1.0))
+                rows = max(bottom[k] - ty * TILE, 0) | min(top[k] - ty * TILE, TILE - 1) << 4
                 for tx in range(spans[r, 0] // TILE, spans[r, 1] // TILE + 1):
                     strip_low = max(spans[r, 0] - tx * TILE, 0) // STRIP
                     strip_high = min(spans[r, 1] - tx * TILE, TILE - 1) // STRIP
                     t = ty * tiles_x + tx
-                    ids[cursor[t]] = i
-                    slots[cursor[t]] = slot
-                    boxes[cursor[t]] = row_low | row_high << 4 | strip_low << 8 | strip_high << 12
+                    entry = entries[cursor[t]]
+                    entry[ID], entry[SLOT] = i, slot
+                    entry[BOX] = rows | strip_low << 8 | strip_high << 12
                     cursor[t] += 1
                     slot += 1
-    return offsets, ids, boxes, slots, first, count
+    return offsets, entries, first, count

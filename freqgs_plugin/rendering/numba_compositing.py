@@ -13,7 +13,7 @@ import numpy as np
 
 from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from freqgs_plugin.rendering.numba_binning import STRIP, TILE
+from freqgs_plugin.rendering.numba_binning import BOX, ID, SLOT, STRIP, TILE
 from freqgs_plugin.rendering.numba_lanes import (
     LANES,
     any_set,
@@ -24,27 +24,9 @@ from freqgs_plugin.rendering.numba_lanes import (
     minimum,
     select,
     store,
-    total,
+    store_totals,
 )
-from freqgs_plugin.rendering.numba_projection import (
-    ABS_X,
-    ABS_Y,
-    OPACITY,
-    STAT_X,
-    STAT_Y,
-    V_A,
-    V_B,
-    V_C,
-    V_COLUMNS,
-    V_OPACITY,
-    V_X,
-    V_Y,
-    S,
-    U,
-    V,
-    X,
-    Y,
-)
+from freqgs_plugin.rendering.numba_projection import OPACITY, V_COLUMNS, S, U, V, X, Y
 
 ROWS = LANES // STRIP
 """rows of a strip that are computed at once"""
@@ -52,7 +34,7 @@ f4 = np.float32
 PIXELS = TILE * TILE
 STRIP_PIXELS = TILE * STRIP
 _ALPHA_MAX, _ALPHA_MIN, _STOP = f4(ALPHA_MAX), f4(ALPHA_MIN), f4(TRANSMITTANCE_MIN)
-_ZERO, _ONE, _HALF, _TWO = f4(0), f4(1), f4(0.5), f4(2)
+_ZERO, _ONE, _HALF, _EIGHT = f4(0), f4(1), f4(0.5), f4(8)
 _CHECK_EVERY = 16
 """Gaussians between two looks at which rows of a tile are unfinished"""
 
@@ -166,7 +148,7 @@ def _finish(block, p, count, image, light, depth, background, with_depth, y, c):
 
 @njit(parallel=True, fastmath=_FAST, error_model="numpy", cache=True)
 def composite(
-    offsets, ids, boxes, splats, depths, level, prefixes, features, background, with_depth, width, height,
+    offsets, entries, splats, depths, level, prefixes, features, background, with_depth, width, height,
     image, light, depth,
 ):  # fmt: skip
     """Fill `image` [prefixes, 3, h, w], `light` (final transmittance) [prefixes, h, w] and, if asked, `depth` [h, w].
@@ -186,7 +168,7 @@ def composite(
         last_prefix = _last_prefix(level, prefixes)
         since_check, first_row, last_row = 0, 0, TILE - 1
         for entry in range(offsets[t], offsets[t + 1]):
-            i, box = ids[entry], np.int64(boxes[entry])
+            i, box = entries[entry, ID], np.int64(entries[entry, BOX])
             gx, gy = splats[i, X] - f4(tx * TILE), splats[i, Y] - f4(ty * TILE)
             su, ss, sv, opacity = splats[i, U], splats[i, S], splats[i, V], splats[i, OPACITY]
             qu, qs, qv = su * _QUARTER, ss * _QUARTER, sv * _SIXTEENTH
@@ -250,10 +232,10 @@ def _start_gradient(scratch, at, tx, ty, width, height, image, light, v_image, v
 
 @njit(parallel=True, fastmath=_FAST, error_model="numpy", cache=True)
 def composite_backward(
-    offsets, ids, boxes, slots, splats, level, prefixes, own, features, width, height,
+    offsets, entries, splats, level, prefixes, own, features, width, height,
     image, light, v_image, v_light, partial,
 ):  # fmt: skip
-    """Write each entry's gradient to its slot of `partial` [entries, V_COLUMNS]: no two threads share a slot.
+    """Write each entry's sums to its slot of `partial` [entries * V_COLUMNS]: no two threads share a slot.
 
     `own`: the statistic columns hold the gradient of the prefix that equals the Gaussian's level, else of the last one.
     """
@@ -270,12 +252,11 @@ def composite_backward(
         last_prefix = _last_prefix(level, prefixes)
         since_check, first_row, last_row = 0, 0, TILE - 1
         for entry in range(offsets[t], offsets[t + 1]):
-            out = partial[slots[entry]]
+            slot = np.int64(entries[entry, SLOT])
             if first_row > last_row:
-                for column in range(V_COLUMNS):
-                    out[column] = _ZERO
+                partial[slot * V_COLUMNS : (slot + 1) * V_COLUMNS] = _ZERO
                 continue
-            i, box = ids[entry], np.int64(boxes[entry])
+            i, box = entries[entry, ID], np.int64(entries[entry, BOX])
             gx, gy = splats[i, X] - f4(tx * TILE), splats[i, Y] - f4(ty * TILE)
             su, ss, sv, opacity = splats[i, U], splats[i, S], splats[i, V], splats[i, OPACITY]
             qu, qs, qv = su * _QUARTER, ss * _QUARTER, sv * _SIXTEENTH
@@ -335,22 +316,11 @@ def composite_backward(
                 myy = myy + syy
                 jx = jx + r * dx
                 jy = jy + ry
-            a, b, c = _TWO * su * su, _TWO * su * ss, _TWO * (sv + ss * ss)
-            x_sum, y_sum, x_judged, y_judged = total(mx), total(my), total(jx), total(jy)
-            out[0] = total(v0)
-            out[1] = total(v1)
-            out[2] = total(v2)
-            out[V_OPACITY] = total(m) / opacity
-            out[V_X] = a * x_sum + b * y_sum
-            out[V_Y] = b * x_sum + c * y_sum
-            out[V_A] = -_HALF * total(mxx)
-            out[V_B] = -total(mxy)
-            out[V_C] = -_HALF * total(myy)
-            out[STAT_X] = a * x_judged + b * y_judged
-            out[STAT_Y] = b * x_judged + c * y_judged
             # u is U dx + S dy, quartered: (d/dx, d/dy)(u^2 + v^2) = 8 (U u, S u + V dy / 4)
-            out[ABS_X] = f4(8) * su * total(ax)
-            out[ABS_Y] = f4(8) * total(ay)
+            store_totals(
+                partial, slot * V_COLUMNS,
+                (v0, v1, v2, m, mx, my, mxx, mxy, myy, jx, jy, ax * _EIGHT, ay * _EIGHT, zero, zero, zero),
+            )  # fmt: skip
             since_check += 1
             if since_check == _CHECK_EVERY:
                 since_check = 0

@@ -169,17 +169,54 @@ def any_set(typingctx, mask):
     return types.boolean(mask_type), build
 
 
+TOTALS = 16
+"""how many sums `store_totals` makes"""
+
+
 @intrinsic
-def total(typingctx, a):
-    """Sum of all lanes, float32."""
+def store_totals(typingctx, array, index, values):
+    """array[index + k] = sum of all lanes of values[k], for a tuple of TOTALS Lanes and a contiguous float32 array [n].
+
+    Lanes are added pairwise while sums of different values move together: a third of the work of one sum after another.
+    """
 
     def build(context, builder, sig, args):
-        value, width = args[0], LANES
-        while width > 1:
-            width //= 2
-            order = ir.VectorType(ir.IntType(32), LANES)
-            upper = ir.Constant(order, [(i + width) % LANES for i in range(LANES)])
-            value = builder.fadd(value, builder.shuffle_vector(value, value, upper), flags=_FLAGS)
-        return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
+        rows = cgutils.unpack_tuple(builder, args[2])
+        for start in range(0, TOTALS, LANES):
+            sums = rows[start : start + LANES]
+            width = LANES
+            while width > 1:
+                width //= 2
+                pairs = zip(sums[: len(sums) // 2], sums[len(sums) // 2 :], strict=True)
+                sums = [_fold(builder, a, b, width) for a, b in pairs]
+            at = builder.add(args[1], ir.Constant(args[1].type, start))
+            builder.store(sums[0], _address(context, builder, sig.args[0], args[0], at), align=4)
+        return context.get_dummy_value()
 
-    return types.float32(lanes_type), build
+    return types.void(array, types.intp, types.UniTuple(lanes_type, TOTALS)), build
+
+
+def _fold(builder: Any, a: Any, b: Any, width: int) -> Any:
+    """Of each block of 2 * `width` lanes the sum of its halves: a's in the lower half, b's in the upper."""
+    order = ir.VectorType(ir.IntType(32), LANES)
+    block = [(lane // (2 * width) * 2 * width + lane % width, lane // width % 2 * LANES) for lane in range(LANES)]
+    halves = (ir.Constant(order, [lane + source + shift for lane, source in block]) for shift in (0, width))
+    low, high = (builder.shuffle_vector(a, b, half) for half in halves)
+    return builder.fadd(low, high, flags=_FLAGS)
+
+
+@intrinsic
+def add_row(typingctx, sums, array, index):
+    """sums[k] += array[index + k] for k < TOTALS, of contiguous arrays: float64 [TOTALS] and float32 [n]."""
+
+    def build(context, builder, sig, args):
+        wide = ir.VectorType(ir.DoubleType(), TOTALS)
+        row = ir.VectorType(ir.FloatType(), TOTALS)
+        source = context.make_array(sig.args[1])(context, builder, args[1]).data
+        numbers = builder.load(builder.bitcast(builder.gep(source, [args[2]]), row.as_pointer()), align=4)
+        target = builder.bitcast(context.make_array(sig.args[0])(context, builder, args[0]).data, wide.as_pointer())
+        before = builder.load(target, align=8)
+        builder.store(builder.fadd(before, builder.fpext(numbers, wide)), target, align=8)
+        return context.get_dummy_value()
+
+    return types.void(sums, array, types.intp), build

@@ -12,15 +12,19 @@ import numpy as np
 from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.functional.projection import QUATERNION_MIN, STD_MAX
 from freqgs_plugin.rendering.base import ALPHA_MIN, FOV_MARGIN, NEAR_PLANE, RADIUS_SIGMAS
+from freqgs_plugin.rendering.numba_lanes import TOTALS, add_row
 
 # columns of a projected Gaussian: centre (px), its falloff exp(-(U dx + S dy)^2 - V dy^2), opacity after compensation,
 # and the half-width and half-height (px) of the ellipse on which alpha >= ALPHA_MIN
 X, Y, U, S, V, OPACITY, REACH_X, REACH_Y = range(8)
 COLUMNS = 8
+_CHUNK = 256
+"""Gaussians that one thread takes at a time"""
 
-# columns of the gradient of one Gaussian (or of one Gaussian in one tile)
-V_OPACITY, V_X, V_Y, V_A, V_B, V_C, STAT_X, STAT_Y, ABS_X, ABS_Y = range(3, 13)
-V_COLUMNS = 13
+# what a Gaussian's gradient is made of, as sums over pixels (of one tile): three columns for its features, then moments
+# of g = alpha dL/dalpha about its centre, first moments of the judged part of g, and of its absolutes
+MASS, M_X, M_Y, M_XX, M_XY, M_YY, STAT_X, STAT_Y, ABS_X, ABS_Y = range(3, 13)
+V_COLUMNS = TOTALS
 
 
 @njit(error_model="numpy", fastmath={"contract"}, cache=True)
@@ -71,7 +75,7 @@ def _limits(fx, fy, cx, cy, width, height):
     return -cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y
 
 
-@njit(error_model="numpy", fastmath={"contract"}, cache=True)
+@njit(error_model="numpy", fastmath={"contract"}, inline="always")
 def _project_one(
     i, means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, out, conics, depths, radii
 ):  # fmt: skip
@@ -136,35 +140,28 @@ def project(
         )  # fmt: skip
 
 
-@njit(error_model="numpy", fastmath={"contract"}, cache=True)
+@njit(error_model="numpy", fastmath={"contract"}, inline="always")
 def _carry_back_one(
     i, means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, moves,
-    first, count, partial, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_abs, v_view,
+    splats, sums, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_abs, v_view,
 ):  # fmt: skip
     fx, fy, cx, cy = intrinsics
     low_u, high_u, low_v, high_v = _limits(fx, fy, cx, cy, width, height)
     R = view[:3, :3]
     want_view = v_view.shape[0] > 0
-    g0 = g1 = g2 = v_alpha = v_x = v_y = v_a = v_b = v_c = stat_x = stat_y = abs_x = abs_y = 0.0
-    for row in range(first[i], first[i] + count[i]):
-        g0 += partial[row, 0]
-        g1 += partial[row, 1]
-        g2 += partial[row, 2]
-        v_alpha += partial[row, V_OPACITY]
-        v_x += partial[row, V_X]
-        v_y += partial[row, V_Y]
-        v_a += partial[row, V_A]
-        v_b += partial[row, V_B]
-        v_c += partial[row, V_C]
-        stat_x += partial[row, STAT_X]
-        stat_y += partial[row, STAT_Y]
-        abs_x += partial[row, ABS_X]
-        abs_y += partial[row, ABS_Y]
-    v_features[i, 0], v_features[i, 1], v_features[i, 2] = g0, g1, g2
-    v_means2d[i, 0], v_means2d[i, 1] = stat_x, stat_y
-    v_abs[i, 0], v_abs[i, 1] = abs_x, abs_y
+    # conic of exp(-(U dx + S dy)^2 - V dy^2) = exp(-(A dx^2 + 2 B dx dy + C dy^2) / 2)
+    su, ss, sv = np.float64(splats[i, U]), np.float64(splats[i, S]), np.float64(splats[i, V])
+    conic_a, conic_b, conic_c = 2.0 * su * su, 2.0 * su * ss, 2.0 * (sv + ss * ss)
+    v_features[i, 0], v_features[i, 1], v_features[i, 2] = sums[0], sums[1], sums[2]
+    v_means2d[i, 0] = conic_a * sums[STAT_X] + conic_b * sums[STAT_Y]
+    v_means2d[i, 1] = conic_b * sums[STAT_X] + conic_c * sums[STAT_Y]
+    v_abs[i, 0], v_abs[i, 1] = su * sums[ABS_X], sums[ABS_Y]
     if not moves:
         return
+    v_alpha = sums[MASS] / splats[i, OPACITY]
+    v_x = conic_a * sums[M_X] + conic_b * sums[M_Y]
+    v_y = conic_b * sums[M_X] + conic_c * sums[M_Y]
+    v_a, v_b, v_c = -0.5 * sums[M_XX], -sums[M_XY], -0.5 * sums[M_YY]
 
     m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     z = R[2, 0] * m0 + R[2, 1] * m1 + R[2, 2] * m2 + view[2, 3]
@@ -269,18 +266,24 @@ def _carry_back_one(
 
 @njit(parallel=True, error_model="numpy", fastmath={"contract"}, cache=True)
 def project_backward(
-    means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, moves,
+    means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, moves, splats,
     first, count, partial, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_abs, v_view,
 ):  # fmt: skip
-    """Sum each Gaussian's rows of `partial` [slots, V_COLUMNS] and carry them back to its parameters.
+    """Sum each Gaussian's rows of `partial` [slots * V_COLUMNS] and carry them back to its parameters.
 
-    `first` and `count` [n] name a Gaussian's rows. `v_view` [n, 12] receives each Gaussian's share of the gradient of
-    the world-to-camera matrix (rows of R, then t) unless it has no rows. Unless `moves`, only features and statistics
-    are wanted.
+    `first` and `count` [n] name a Gaussian's rows, `splats` [n, COLUMNS] is what `project` made of it. `v_view` [n, 12]
+    receives each Gaussian's share of the gradient of the world-to-camera matrix (rows of R, then t) unless it has no
+    rows. Unless `moves`, only features and statistics are wanted.
     """
-    for i in prange(means.shape[0]):
-        if count[i] > 0:
-            _carry_back_one(
-                i, means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, moves,
-                first, count, partial, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_abs, v_view,
-            )  # fmt: skip
+    n = means.shape[0]
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        sums = np.empty(V_COLUMNS)
+        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
+            if count[i] > 0:
+                sums[:] = 0.0
+                for row in range(first[i], first[i] + count[i]):
+                    add_row(sums, partial, row * V_COLUMNS)
+                _carry_back_one(
+                    i, means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, moves,
+                    splats, sums, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_abs, v_view,
+                )  # fmt: skip

@@ -21,7 +21,11 @@ def shade(gaussians: Gaussians, camera: Camera, weight: Float[Tensor, " n"] | No
         scales=gaussians.scales,
         opacities=gaussians.opacities if weight is None else gaussians.opacities * weight,
         features=level_colours(
-            gaussians.sh, gaussians.means - camera.centre, gaussians.level, gaussians.signed_residuals
+            gaussians.features_dc,
+            gaussians.features_rest,
+            gaussians.means - camera.centre,
+            gaussians.level,
+            gaussians.signed_residuals,
         ),
     )
 

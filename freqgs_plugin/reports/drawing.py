@@ -80,7 +80,8 @@ def colour_by_level(gaussians: Gaussians) -> Gaussians:
         quats=gaussians.quats,
         scales=gaussians.scales,
         opacities=gaussians.opacities,
-        sh=((colours - 0.5) / C0)[:, None],
+        features_dc=(colours - 0.5) / C0,
+        features_rest=colours.new_zeros(len(colours), 0, 3),
         level=gaussians.level,
         signed_residuals=False,
     )

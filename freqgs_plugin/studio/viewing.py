@@ -139,13 +139,13 @@ class SplatViews(SplatfactoModel):
 
     def gaussians(self) -> Gaussians:
         """The scene with activated parameters: where exp and sigmoid are, and nowhere else."""
-        rest = self.features_rest[:, : (self._sh_degree + 1) ** 2 - 1]
         return Gaussians(
             means=self.means,
             quats=self.quats,
             scales=torch.exp(self.scales),
             opacities=torch.sigmoid(self.gauss_params["opacities"]).squeeze(-1),
-            sh=torch.cat([self.features_dc[:, None], rest], 1),
+            features_dc=self.features_dc,
+            features_rest=self.features_rest[:, : (self._sh_degree + 1) ** 2 - 1],
             level=self.level,  # pyright: ignore[reportArgumentType]
             signed_residuals=self._signed(),
         )

@@ -27,7 +27,8 @@ CAMERA = Camera(torch.eye(4), torch.eye(3), 4, 4)
 
 def gaussians():
     n = len(LEVELS)
-    return Gaussians(torch.zeros(n, 3), torch.ones(n, 4), torch.ones(n, 3), torch.ones(n), torch.zeros(n, 1, 3), LEVELS)
+    colours = (torch.zeros(n, 3), torch.zeros(n, 0, 3))
+    return Gaussians(torch.zeros(n, 3), torch.ones(n, 4), torch.ones(n, 3), torch.ones(n), *colours, LEVELS)
 
 
 @pytest.mark.parametrize("k", range(7))
@@ -84,7 +85,8 @@ def decaying(distance, decay=5.0, opacity=0.8, dtype=torch.float32):
         quats=torch.ones(n, 4, dtype=dtype),
         scales=torch.ones(n, 3, dtype=dtype),
         opacities=torch.as_tensor(opacity, dtype=dtype).expand(n).clone(),
-        sh=torch.zeros(n, 1, 3, dtype=dtype),
+        features_dc=torch.zeros(n, 3, dtype=dtype),
+        features_rest=torch.zeros(n, 0, 3, dtype=dtype),
         level=torch.ones(n, dtype=torch.int32),
         decay=torch.as_tensor(decay, dtype=dtype).expand(n).clone(),
     )

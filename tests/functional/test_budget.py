@@ -16,7 +16,7 @@ from freqgs_plugin.functional.projection import project
 from freqgs_plugin.types import Camera, Gaussians
 
 CAMERA = Camera(torch.eye(4), torch.tensor([[90.0, 0, 60], [0, 90.0, 45], [0, 0, 1]]), 120, 90)
-KEYS = ("means", "quats", "scales", "opacities", "sh", "level", "decay")
+KEYS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest", "level", "decay")
 DTYPES = [torch.float32, torch.float64]
 
 
@@ -29,7 +29,8 @@ def gaussians(n=2000, seed=0, dtype=torch.float32, levels=1, spread=3.0):
         quats=torch.randn(n, 4, generator=g).to(dtype),
         scales=torch.exp(torch.randn(n, 3, generator=g) - 4).to(dtype),
         opacities=torch.sigmoid(3 * torch.randn(n, generator=g)).to(dtype),
-        sh=torch.zeros(n, 1, 3, dtype=dtype),
+        features_dc=torch.zeros(n, 3, dtype=dtype),
+        features_rest=torch.zeros(n, 0, 3, dtype=dtype),
         level=torch.randint(1, levels + 1, (n,), generator=g),
         decay=(4 + 2 * torch.randn(n, generator=g)).to(dtype),
     )
@@ -107,7 +108,8 @@ def test_everything_that_a_rasterizer_draws_is_in_view(name, dtype):
         splats.quats.to(dtype),
         splats.scales.to(dtype),
         splats.opacities.to(dtype),
-        torch.zeros(len(splats), 1, 3, dtype=dtype),
+        torch.zeros(len(splats), 3, dtype=dtype),
+        torch.zeros(len(splats), 0, 3, dtype=dtype),
         torch.ones(len(splats), dtype=torch.int64),
     )
     drawn = project(scene.means, scene.quats, scene.scales, camera, blur=0.3).visible

@@ -27,14 +27,19 @@ def matrices(quats):
     return torch.stack([torch.stack(row, -1) for row in rotation_rows(quats)], -2)
 
 
+def _evaluate(coefficients, d):
+    coefficients = coefficients.expand(len(d), -1, -1)
+    return evaluate_in_torch(coefficients[:, 0], coefficients[:, 1:], d)
+
+
 @pytest.mark.parametrize("degree", range(5))
 def test_rotated_harmonics_are_the_harmonics_of_rotated_directions(degree):
     sh = torch.randn(5, (degree + 1) ** 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     move = similarity(degree)
     d = directions()
     for row in sh:
-        before = evaluate_in_torch(row[None].expand(len(d), -1, -1), d)
-        after = evaluate_in_torch(move.harmonics(row[None]).expand(len(d), -1, -1), d @ move.rotation.T)
+        before = _evaluate(row[None], d)
+        after = _evaluate(move.harmonics(row[None]), d @ move.rotation.T)
         torch.testing.assert_close(after, before, rtol=0, atol=1e-13)
 
 

@@ -228,13 +228,13 @@ def test_a_moved_scene_looks_the_same():
     raw = replace(raw, means=raw.means * 0.5 + torch.tensor([0.0, 0, 4]), opacities=raw.opacities + 2)
 
     def picture(raw, viewmat):
-        sh = torch.cat([raw.features_dc[:, None], raw.features_rest], 1)
         scene = Gaussians(
             raw.means,
             raw.quats,
             raw.scales.exp(),
             raw.opacities.sigmoid()[:, 0],
-            sh,
+            raw.features_dc,
+            raw.features_rest,
             torch.ones(len(raw), dtype=torch.int32),
         )
         K = torch.tensor([[80.0, 0, 40], [0, 80, 30], [0, 0, 1]])

@@ -174,7 +174,7 @@ def test_prefixes_are_separate_renders(rasterizer, assert_close, view, levels, s
     splats, camera = scenes.leaves_of(splats, torch.float32), scenes.cast(camera, torch.float32)
     level = torch.randint(1, levels + 1, (len(splats),), generator=scenes.generator(seed))
     sh = noise(len(splats), 4, 3).float()
-    gaussians = Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, sh, level)
+    gaussians = Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, sh[:, 0], sh[:, 1:], level)
     prefixes = render_prefixes(gaussians, camera, levels, rasterizer=rasterizer, statistics=statistics)
     assert len(prefixes) == levels
     for k, prefix in enumerate(prefixes, start=1):

@@ -6,6 +6,8 @@ import pytest
 from freqgs_plugin.functional.numba_threads import njit
 from freqgs_plugin.rendering.numba_lanes import (
     LANES,
+    TOTALS,
+    add_row,
     any_set,
     lanes,
     load,
@@ -14,7 +16,7 @@ from freqgs_plugin.rendering.numba_lanes import (
     minimum,
     select,
     store,
-    total,
+    store_totals,
 )
 
 f4 = np.float32
@@ -37,13 +39,23 @@ def _apply(a, b, number, out):
 
 
 @njit(error_model="numpy")
-def _total_and_any(a, bound):
-    sums = lanes(f4(0))
+def _any_above(a, bound):
     found = False
     for i in range(0, len(a), LANES):
-        sums = sums + load(a, i)
         found |= any_set(load(a, i) > bound)
-    return total(sums), found
+    return found
+
+
+@njit(error_model="numpy")
+def _totals(a, out, sums):
+    v = LANES
+    rows = (
+        load(a, 0), load(a, v), load(a, 2 * v), load(a, 3 * v), load(a, 4 * v), load(a, 5 * v), load(a, 6 * v),
+        load(a, 7 * v), load(a, 8 * v), load(a, 9 * v), load(a, 10 * v), load(a, 11 * v), load(a, 12 * v),
+        load(a, 13 * v), load(a, 14 * v), load(a, 15 * v),
+    )  # fmt: skip
+    store_totals(out, 3, rows)
+    add_row(sums, out, 3)
 
 
 @pytest.fixture
@@ -67,8 +79,17 @@ def test_each_operation_is_numpys(pair: tuple[np.ndarray, np.ndarray]):
 
 
 @pytest.mark.parametrize("position", [0, LANES - 1, 2 * LANES + 3])
-def test_total_and_any_see_every_lane(position: int):
+def test_any_set_sees_every_lane(position: int):
     a = np.ones(4 * LANES, f4)
-    assert _total_and_any(a, f4(1)) == (4 * LANES, False)
+    assert not _any_above(a, f4(1))
     a[position] = 2
-    assert _total_and_any(a, f4(1)) == (4 * LANES + 1, True)
+    assert _any_above(a, f4(1))
+
+
+def test_totals_are_in_their_places_and_nowhere_else():
+    a = np.random.default_rng(1).integers(-99, 99, (TOTALS, LANES)).astype(f4)
+    out, sums = np.full(TOTALS + 5, f4(7)), np.arange(TOTALS, dtype=np.float64)
+    _totals(a.ravel(), out, sums)
+    np.testing.assert_array_equal(out[3:-2], a.sum(1))
+    np.testing.assert_array_equal(np.delete(out, slice(3, 3 + TOTALS)), f4(7))
+    np.testing.assert_array_equal(sums, np.arange(TOTALS) + a.sum(1))

@@ -18,7 +18,7 @@ def gaussians(n=40):
     generator = torch.Generator().manual_seed(3)
     sh = torch.randn(n, 4, 3, generator=generator) * 0.3
     level = torch.randint(1, 4, (n,), generator=generator, dtype=torch.int32)
-    return Gaussians(s.means, s.quats, s.scales, s.opacities, sh, level)
+    return Gaussians(s.means, s.quats, s.scales, s.opacities, sh[:, 0], sh[:, 1:], level)
 
 
 @pytest.fixture(params=[NumbaRasterizer, TorchRasterizer])
@@ -91,7 +91,8 @@ def test_what_is_covered_or_outside_weighs_nothing(rasterizer):
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
         scales=torch.tensor([[5.0] * 3, [0.01] * 3, [0.1] * 3]),
         opacities=torch.tensor([1.0, 1.0, 1.0]),
-        sh=torch.zeros(n, 1, 3),
+        features_dc=torch.zeros(n, 3),
+        features_rest=torch.zeros(n, 0, 3),
         level=torch.ones(n, dtype=torch.int32),
     )
     weight = rendered_weight(g, scenes.camera(width=9, height=9, dtype=torch.float32), 1, rasterizer=rasterizer)

@@ -11,12 +11,16 @@ from freqgs_plugin.types import Gaussians
 
 def fake_run(levels=3, n=60, signed=True):
     g = torch.Generator().manual_seed(0)
+    means, quats = torch.rand(n, 3, generator=g) - 0.5, torch.randn(n, 4, generator=g)
+    scales, opacities = torch.rand(n, 3, generator=g) * 0.1 + 0.02, torch.rand(n, generator=g) * 0.8 + 0.1
+    sh = torch.randn(n, 4, 3, generator=g) * 0.5
     gaussians = Gaussians(
-        means=torch.rand(n, 3, generator=g) - 0.5,
-        quats=torch.randn(n, 4, generator=g),
-        scales=torch.rand(n, 3, generator=g) * 0.1 + 0.02,
-        opacities=torch.rand(n, generator=g) * 0.8 + 0.1,
-        sh=torch.randn(n, 4, 3, generator=g) * 0.5,
+        means=means,
+        quats=quats,
+        scales=scales,
+        opacities=opacities,
+        features_dc=sh[:, 0],
+        features_rest=sh[:, 1:],
         level=torch.arange(n) % levels + 1,
         signed_residuals=signed,
     )

@@ -32,7 +32,7 @@ def test_levels_picture_holds_only_mixtures_of_the_levels_colours():
     picture, alpha = levels_picture(run, view.camera), draw(run, view.camera).alpha
     torch.testing.assert_close(picture, alpha * torch.tensor(LEVEL_COLOURS[0]), atol=1e-5, rtol=1e-4)
     three = colour_by_level(fake_run(levels=3).gaussians)
-    assert len(torch.unique(three.sh, dim=0)) == 3 and not three.signed_residuals
+    assert len(torch.unique(three.features_dc, dim=0)) == 3 and not three.signed_residuals
 
 
 def test_psnr_has_its_closed_form():

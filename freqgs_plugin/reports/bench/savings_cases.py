@@ -18,7 +18,7 @@ from freqgs_plugin.training.objective import PyramidTargets
 from freqgs_plugin.types import Camera, Gaussians, Splats
 
 DECAY_SCALE = 5.0
-LEAVES = ("means", "quats", "scales", "opacities", "sh")
+LEAVES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 
 
 @dataclass(frozen=True)
@@ -149,33 +149,32 @@ def _picture_of(gaussians: Gaussians, s: Subject, options: dict[str, Any]) -> Te
 def _harmonics(s: Subject) -> list[Saving]:
     g = s.gaussians
     offsets = g.means - s.camera.centre
-    padded = g.sh.clone()
-    padded[:, 1:] = 0
+    zeros = torch.zeros_like(g.features_rest)
     upstream = torch.randn(len(g), 3, generator=torch.Generator().manual_seed(IMAGE_SEED))
     with torch.no_grad():
         seen = get_rasterizer("numba", "cpu", absgrad=False)(shade(g, s.camera), s.camera).info["radii"][0] > 0
 
-    def colours(sh: Tensor) -> Tensor:
-        sh, means = sh.clone().requires_grad_(), g.means.clone().requires_grad_()
-        colour = level_colours(sh, means - s.camera.centre, g.level, g.signed_residuals)
+    def colours(rest: Tensor) -> Tensor:
+        dc, rest, means = (t.clone().requires_grad_() for t in (g.features_dc, rest, g.means))
+        colour = level_colours(dc, rest, means - s.camera.centre, g.level, g.signed_residuals)
         colour.backward(upstream)
         return colour.detach()
 
     def backward(gradient: Tensor) -> Tensor:
-        sh = g.sh.clone().requires_grad_()
-        evaluate(sh, offsets.clone().requires_grad_()).backward(gradient)
-        assert sh.grad is not None
-        return sh.grad[seen]
+        dc, rest = g.features_dc.clone().requires_grad_(), g.features_rest.clone().requires_grad_()
+        evaluate(dc, rest, offsets.clone().requires_grad_()).backward(gradient)
+        assert rest.grad is not None
+        return rest.grad[seen]
 
-    degree = round(g.sh.shape[1] ** 0.5) - 1
+    degree = round((g.features_rest.shape[1] + 1) ** 0.5) - 1
     if degree == 0:
         return []
     return [
         Saving(
             "harmonics above the degree in use",
             f"zeros up to degree {degree} against degree 0 alone, as at the beginning of training; both directions",
-            lambda: colours(padded),
-            lambda: colours(padded[:, :1]),
+            lambda: colours(zeros),
+            lambda: colours(zeros[:, :0]),
         ),
         Saving(
             "harmonics' gradients of Gaussians that the view does not show",

@@ -123,12 +123,14 @@ def with_detail(of: Workload, levels: int) -> Gaussians:
     """The workload's Gaussians with harmonics of degree 3, random levels, and decays log-uniform in 0.1 to 3."""
     g = torch.Generator().manual_seed(DETAIL_SEED)
     s, n = of.splats, len(of.splats)
+    sh = torch.randn(n, 16, 3, generator=g) * 0.3
     return Gaussians(
         means=s.means,
         quats=s.quats,
         scales=s.scales,
         opacities=s.opacities,
-        sh=torch.randn(n, 16, 3, generator=g) * 0.3,
+        features_dc=sh[:, 0].contiguous(),
+        features_rest=sh[:, 1:].contiguous(),
         level=random_levels(n, levels),
         decay=torch.exp(torch.rand(n, generator=g) * math.log(30.0)) * 0.1,
     )

@@ -115,18 +115,22 @@ def _geometry() -> list[Case]:
     def view(leaves: Tensors) -> Camera:
         return Camera(leaves["viewmat"], leaves["K"], 37, 29)
 
+    def coloured(function: Callable[..., torch.Tensor], leaves: Tensors) -> torch.Tensor:
+        return function(leaves["sh"][:, 0], leaves["sh"][:, 1:], leaves["means"] - view(leaves).centre)
+
     def decayed(leaves: Tensors) -> torch.Tensor:
         level = torch.ones(24, dtype=torch.int64)
         still = torch.ones_like(leaves["means"])
         quats = torch.cat([still, still[:, :1]], 1)
+        colours = (leaves["sh"][:, 0], leaves["sh"][:, 1:])
         gaussians = Gaussians(
-            leaves["means"], quats, still, leaves["opacities"], leaves["sh"], level, decay=leaves["decay"]
+            leaves["means"], quats, still, leaves["opacities"], *colours, level, decay=leaves["decay"]
         )
         return DistanceDecay(2.0, "frustum_max")(gaussians, view(leaves))
 
     return [
         case("camera centre", lambda leaves: view(leaves).centre),
-        case("colours", lambda leaves: evaluate(leaves["sh"], leaves["means"] - view(leaves).centre)),
-        case("colours in torch", lambda leaves: evaluate_in_torch(leaves["sh"], leaves["means"] - view(leaves).centre)),
+        case("colours", lambda leaves: coloured(evaluate, leaves)),
+        case("colours in torch", lambda leaves: coloured(evaluate_in_torch, leaves)),
         case("distance decay", decayed),
     ]

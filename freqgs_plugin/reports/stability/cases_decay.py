@@ -116,8 +116,8 @@ def _gaussians(leaves: Tensors) -> Gaussians:
     n = len(leaves["means"])
     ones = leaves["means"].new_ones(n, 4)
     level = torch.ones(n, dtype=torch.int64)
-    sh = leaves["means"].new_zeros(n, 1, 3)
-    return Gaussians(leaves["means"], ones, ones[:, :3], leaves["opacities"], sh, level, decay=leaves["decay"])
+    black = (leaves["means"].new_zeros(n, 3), leaves["means"].new_zeros(n, 0, 3))
+    return Gaussians(leaves["means"], ones, ones[:, :3], leaves["opacities"], *black, level, decay=leaves["decay"])
 
 
 def _decays() -> list[Case]:
@@ -202,19 +202,20 @@ def _pictures() -> list[Case]:
         def inputs() -> Tensors:
             gaussians, eye = splats(), camera()
             generator = torch.Generator().manual_seed(5)
-            sh = torch.randn(24, 1, 3, generator=generator, dtype=torch.float64)
+            dc = torch.randn(24, 3, generator=generator, dtype=torch.float64)
             leaves = {key: getattr(gaussians, key) for key in LEAVES if key != "features"}
             background = torch.tensor(BACKGROUND, dtype=torch.float64)
             decays = torch.full((24,), decay).double()
-            return {**leaves, "sh": sh, "decay": decays, "background": background, "viewmat": eye.viewmat, "K": eye.K}
+            return {**leaves, "dc": dc, "decay": decays, "background": background, "viewmat": eye.viewmat, "K": eye.K}
 
         def compute(setting: Setting) -> Compute:
             rasterizer = get_rasterizer(setting.backend, setting.device)
 
             def f(leaves: Tensors) -> Tensors:
                 level = torch.ones(24, dtype=torch.int64, device=leaves["means"].device)
-                means, quats, scales, opacities, sh = (leaves[key] for key in (*LEAVES[:4], "sh"))
-                gaussians = Gaussians(means, quats, scales, opacities, sh, level, decay=leaves["decay"])
+                means, quats, scales, opacities, dc = (leaves[key] for key in (*LEAVES[:4], "dc"))
+                rest = dc.new_zeros(24, 0, 3)
+                gaussians = Gaussians(means, quats, scales, opacities, dc, rest, level, decay=leaves["decay"])
                 view = Camera(leaves["viewmat"], leaves["K"], 37, 29)
                 decayed = DistanceDecay(scale, "scene", SCENE_DISTANCE)
                 rendering = render(gaussians, view, decayed, rasterizer=rasterizer, background=leaves["background"])
@@ -226,7 +227,7 @@ def _pictures() -> list[Case]:
             view = Camera(leaves["viewmat"], leaves["K"], 37, 29)
             distance = _normalised(leaves["means"], view, "scene")
             weight = plain_weight(leaves["opacities"], distance, leaves["decay"], scale, True)
-            colours = torch.relu(0.28209479177387814 * leaves["sh"][:, 0] + 0.5)
+            colours = torch.relu(0.28209479177387814 * leaves["dc"] + 0.5)
             values = {key: leaves[key] for key in ("means", "quats", "scales")}
             faded = Splats(**values, opacities=leaves["opacities"] * weight, features=colours)
             out = dense(faded, view, leaves["background"], antialiased=True)
