@@ -77,6 +77,12 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     """Gaussians with sigma <= 0, which nothing brings back: removed, or kept from it by a least_decay (ours)"""
     least_decay: float = 0.25
     """sigma is held at or above this where dead_decay is keep (ours)"""
+    densify_grad_thresh: float = 0.0009
+    """2D gradient, in units of half the image, above which a Gaussian grows (ours; splatfacto: 0.0008)"""
+    split_screen_size: float = 0.025
+    """radius on the screen, as a share of the longer side, above which a Gaussian is split (ours; splatfacto: 0.05)"""
+    least_weight: float = 2.0
+    """Gaussians whose weight over all training views is under this many pixels are removed; 0: none (ours)"""
     detail_scales: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 5.0)
     """scales that are evaluated, and offered as outputs detail_1, detail_1.5 ..."""
     init_from: Path | None = None
