@@ -14,6 +14,7 @@ from torch import Tensor
 
 from freqgs_plugin.functional.numba_threads import check_layer
 from freqgs_plugin.rendering.base import BLUR, Statistics, check_entries, check_inputs, check_levels
+from freqgs_plugin.rendering.freed_memory import keep_freed_memory
 from freqgs_plugin.rendering.numba_binning import depth_order, tile_lists
 from freqgs_plugin.rendering.numba_compositing import composite, composite_backward
 from freqgs_plugin.rendering.numba_projection import COLUMNS, OPACITY, V_COLUMNS, project, project_backward
@@ -67,7 +68,7 @@ def _feature_groups(features: Tensor) -> list[Any]:
 
 
 class _Composite(torch.autograd.Function):
-    """(splats, means2d probe, view matrix, background [d]) -> planes [prefixes, d, h, w] over the background, light
+    """(splats, means2d probe, view matrix, background [d]) -> planes [prefixes, d, h, w] over the background, alpha
     [prefixes, h, w], depth [h, w].
     """
 
@@ -77,7 +78,7 @@ class _Composite(torch.autograd.Function):
         probe,
     ):  # fmt: skip
         shape = (view.prefixes, view.height, view.width)
-        light, depth = torch.empty(shape), torch.zeros(shape[1:])
+        alpha, depth = torch.empty(shape), torch.zeros(shape[1:])
         images = []
         backgrounds = _feature_groups(background[None])
         for number, group in enumerate(_feature_groups(features)):
@@ -85,21 +86,25 @@ class _Composite(torch.autograd.Function):
             composite(
                 *view.lists[:2], view.splats, _array(depths), view.level, view.prefixes, group,
                 backgrounds[number][0], with_depth and number == 0, view.width, view.height,
-                image.numpy(), light.numpy(), depth.numpy(),
+                image.numpy(), alpha.numpy(), depth.numpy(),
             )  # fmt: skip
             images.append(image)
-        ctx.save_for_backward(means, quats, scales, opacities, features, light, *images)
+        ctx.save_for_backward(means, quats, scales, opacities, features, alpha, *images)
+        ctx.set_materialize_grads(False)
         ctx.view, ctx.probe = view, probe
         ctx.mark_non_differentiable(depth)
         planes = torch.cat(images, 1) if len(images) > 1 else images[0]
-        return planes[:, : features.shape[1]], light, depth
+        return planes[:, : features.shape[1]], alpha, depth
 
     @staticmethod
-    def backward(ctx, v_planes, v_light, _v_depth):
-        means, quats, scales, opacities, features, light, *images = ctx.saved_tensors
+    def backward(ctx, v_planes, v_alpha, _v_depth):
+        means, quats, scales, opacities, features, alpha, *images = ctx.saved_tensors
         view: _View = ctx.view
         offsets, entries, first, count = view.lists
         n, d = features.shape
+        if v_planes is None:
+            v_planes = torch.zeros(len(alpha), d, *alpha.shape[1:])
+        no_gradient = alpha[:0]
         partial = torch.empty(len(entries) * V_COLUMNS)
         moves, wants_pose = any(ctx.needs_input_grad[:4]) or ctx.needs_input_grad[6], ctx.needs_input_grad[6]
         total, v_feature_groups = {}, []
@@ -110,8 +115,8 @@ class _Composite(torch.autograd.Function):
                 v_image = torch.nn.functional.pad(v_image, (0, 0, 0, 0, 0, missing))
             composite_backward(
                 offsets, entries, view.splats, view.level, view.prefixes, view.own, group,
-                view.width, view.height, images[number].numpy(), light.numpy(), _array(v_image),
-                _array(v_light if number == 0 else torch.zeros_like(v_light)), partial.numpy(),
+                view.width, view.height, images[number].numpy(), alpha.numpy(), _array(v_image),
+                _array(v_alpha if v_alpha is not None and number == 0 else no_gradient), partial.numpy(),
             )  # fmt: skip
             widths = {"means": 3, "quats": 4, "scales": 3, "opacity": 1, "features": 3, "xy": 2, "abs": 2}
             out = {name: torch.zeros(n, width) for name, width in widths.items()}
@@ -130,7 +135,7 @@ class _Composite(torch.autograd.Function):
         if ctx.needs_input_grad[6]:
             rows = total["view"].double().sum(0).float()
             v_pose = torch.cat([torch.cat([rows[:9].view(3, 3), rows[9:, None]], 1), torch.zeros(1, 4)])
-        v_background = (v_planes * light[:, None]).sum((0, 2, 3)) if ctx.needs_input_grad[7] else None
+        v_background = (v_planes * (1 - alpha)[:, None]).sum((0, 2, 3)) if ctx.needs_input_grad[7] else None
         v_all = torch.cat(v_feature_groups, 1) if len(v_feature_groups) > 1 else v_feature_groups[0]
         return (
             total["means"], total["quats"], total["scales"], total["opacity"][:, 0], v_all[:, :d], total["xy"][None],
@@ -211,11 +216,11 @@ class NumbaRasterizer:
         means2d.requires_grad_(wants_grad)
         behind = splats.features.new_zeros(1) if background is None else background.to(splats.features)
         behind = behind.expand(splats.features.shape[1])
-        planes, light, z = _Composite.apply(
+        planes, alpha, z = _Composite.apply(
             splats.means, splats.quats, splats.scales, splats.opacities, splats.features, means2d, camera.viewmat,
             behind, view, depths, depth, means2d if wants_grad and self.absgrad else None,
         )  # fmt: skip
-        alpha = 1 - light[..., None]
+        alpha = alpha[..., None]
         expected = z[..., None]
         if depth:
             expected = torch.where(alpha[0] > 0, expected / alpha[0].clamp_min(1e-10), 0.0).detach()
@@ -249,6 +254,7 @@ def warm_up() -> None:
     global _warm
     if _warm:
         return
+    keep_freed_memory()
     try:
         _render_speck()
     except ValueError as error:

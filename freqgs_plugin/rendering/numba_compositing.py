@@ -22,6 +22,7 @@ from freqgs_plugin.rendering.numba_lanes import (
     magnitude,
     maximum,
     minimum,
+    prefetch_to_write,
     select,
     store,
     store_totals,
@@ -134,26 +135,34 @@ def _unfinished_rows(scratch, prefixes, block):
 
 
 @njit(error_model="numpy", fastmath=_FAST, inline="always")
-def _finish(block, p, count, image, light, depth, background, with_depth, y, c):
+def _finish(block, p, count, image, alpha, depth, background, with_depth, y, c):
     """Write `count` pixels from p on, of one strip, to row y and columns c and on."""
     for x in range(count):
         left_over = abs(block[p + LIGHT * PIXELS + x])
         image[0, y, c + x] = block[p + F0 * PIXELS + x] + left_over * background[0]
         image[1, y, c + x] = block[p + F1 * PIXELS + x] + left_over * background[1]
         image[2, y, c + x] = block[p + F2 * PIXELS + x] + left_over * background[2]
-        light[y, c + x] = left_over
+        alpha[y, c + x] = _ONE - left_over
         if with_depth:
             depth[y, c + x] = block[p + DEPTH * PIXELS + x]
+
+
+@njit(error_model="numpy", inline="always")
+def _ask_for(pictures, tx, ty, width, height):
+    """Have the lines of a tile of pictures [_, h, w] fetched while its Gaussians are blended: writing would wait."""
+    for plane in range(pictures.shape[0]):
+        for y in range(ty * TILE, min(ty * TILE + TILE, height)):
+            prefetch_to_write(pictures, (plane * height + y) * width + tx * TILE)
 
 
 @njit(parallel=True, fastmath=_FAST, error_model="numpy", cache=True)
 def composite(
     offsets, entries, splats, depths, level, prefixes, features, background, with_depth, width, height,
-    image, light, depth,
+    image, alpha, depth,
 ):  # fmt: skip
-    """Fill `image` [prefixes, 3, h, w], `light` (final transmittance) [prefixes, h, w] and, if asked, `depth` [h, w].
+    """Fill `image` [prefixes, 3, h, w], `alpha` [prefixes, h, w] and, if asked, `depth` [h, w].
 
-    `background` [3] fills what light is left.
+    `alpha` is 1 - final transmittance; `background` [3] fills what light is left.
 
     `level` [n] in 1..prefixes, or None: all belong to a single prefix. Depth needs one prefix.
     """
@@ -165,6 +174,8 @@ def composite(
         scratch = _scratch(prefixes * FORWARD_BLOCK)
         for k in range(prefixes):
             _start_light(scratch, k * FORWARD_BLOCK + LIGHT * PIXELS, tx, ty, width, height)
+        _ask_for(image.reshape(prefixes * 3, height, width), tx, ty, width, height)
+        _ask_for(alpha, tx, ty, width, height)
         last_prefix = _last_prefix(level, prefixes)
         since_check, first_row, last_row = 0, 0, TILE - 1
         for entry in range(offsets[t], offsets[t + 1]):
@@ -179,11 +190,11 @@ def composite(
                 u0 = (load(columns, 0) + (f4(strip * STRIP) - gx)) * qu
                 for row in range(max(box & 15, first_row) // ROWS * ROWS, min(box >> 4 & 15, last_row) + 1, ROWS):
                     dy = load(rows, 0) + (f4(row) - gy)
-                    alpha = _alpha(u0 + dy * qs, dy * dy * qv, opacity)
+                    share = _alpha(u0 + dy * qs, dy * dy * qv, opacity)
                     for k in range(first_prefix, last_prefix + 1):
                         at = k * FORWARD_BLOCK + strip * STRIP_PIXELS + row * STRIP
                         before = load(scratch, at + LIGHT * PIXELS)
-                        weight = alpha * maximum(before, lanes(_ZERO))
+                        weight = share * maximum(before, lanes(_ZERO))
                         left = before - weight
                         going = left > _STOP
                         weight = select(going, weight, lanes(_ZERO))
@@ -208,13 +219,13 @@ def composite(
                     p, c = _pixel(start, row), tx * TILE + start
                     # a whole strip is a loop of known length, which becomes a few vector instructions
                     if across - start >= STRIP:
-                        _finish(block, p, STRIP, image[k], light[k], depth, background, with_depth, y, c)
+                        _finish(block, p, STRIP, image[k], alpha[k], depth, background, with_depth, y, c)
                     else:
-                        _finish(block, p, across - start, image[k], light[k], depth, background, with_depth, y, c)
+                        _finish(block, p, across - start, image[k], alpha[k], depth, background, with_depth, y, c)
 
 
 @njit(error_model="numpy", inline="always")
-def _start_gradient(scratch, at, tx, ty, width, height, image, light, v_image, v_light):
+def _start_gradient(scratch, at, tx, ty, width, height, image, v_image):
     _start_light(scratch, at + LIGHT * PIXELS, tx, ty, width, height)
     across = width - tx * TILE
     for row in range(min(TILE, height - ty * TILE)):
@@ -227,15 +238,29 @@ def _start_gradient(scratch, at, tx, ty, width, height, image, light, v_image, v
                 scratch[p + G1 * PIXELS + x] = g1
                 scratch[p + G2 * PIXELS + x] = g2
                 done = g0 * image[0, y, c + x] + g1 * image[1, y, c + x] + g2 * image[2, y, c + x]
-                scratch[p + REST * PIXELS + x] = done + light[y, c + x] * v_light[y, c + x]
+                scratch[p + REST * PIXELS + x] = done
+
+
+@njit(error_model="numpy", inline="always")
+def _add_light(scratch, at, tx, ty, width, height, alpha, v_alpha):
+    """What alpha's gradient adds to the rest: dL/d(1 - alpha) times 1 - alpha."""
+    across = width - tx * TILE
+    for row in range(min(TILE, height - ty * TILE)):
+        y = ty * TILE + row
+        for start in range(0, min(TILE, across), STRIP):
+            p, c = at + _pixel(start, row), tx * TILE + start
+            for x in range(min(STRIP, across - start)):
+                scratch[p + REST * PIXELS + x] -= (_ONE - alpha[y, c + x]) * v_alpha[y, c + x]
 
 
 @njit(parallel=True, fastmath=_FAST, error_model="numpy", cache=True)
 def composite_backward(
     offsets, entries, splats, level, prefixes, own, features, width, height,
-    image, light, v_image, v_light, partial,
+    image, alpha, v_image, v_alpha, partial,
 ):  # fmt: skip
     """Write each entry's sums to its slot of `partial` [entries * V_COLUMNS]: no two threads share a slot.
+
+    `v_alpha` has no prefixes where alpha has no gradient.
 
     `own`: the statistic columns hold the gradient of the prefix that equals the Gaussian's level, else of the last one.
     """
@@ -246,9 +271,9 @@ def composite_backward(
         tx = t - ty * tiles_x
         scratch = _scratch(prefixes * BACKWARD_BLOCK)
         for k in range(prefixes):
-            _start_gradient(
-                scratch, k * BACKWARD_BLOCK, tx, ty, width, height, image[k], light[k], v_image[k], v_light[k]
-            )
+            _start_gradient(scratch, k * BACKWARD_BLOCK, tx, ty, width, height, image[k], v_image[k])
+            if v_alpha.shape[0] > 0:
+                _add_light(scratch, k * BACKWARD_BLOCK, tx, ty, width, height, alpha[k], v_alpha[k])
         last_prefix = _last_prefix(level, prefixes)
         since_check, first_row, last_row = 0, 0, TILE - 1
         for entry in range(offsets[t], offsets[t + 1]):
@@ -274,13 +299,13 @@ def composite_backward(
                 for row in range(max(box & 15, first_row) // ROWS * ROWS, min(box >> 4 & 15, last_row) + 1, ROWS):
                     dy = load(rows, 0) + (f4(row) - gy)
                     u = u0 + dy * qs
-                    alpha = _alpha(u, dy * dy * qv, opacity)
-                    beyond = _ONE / (_ONE - alpha)
-                    v_alpha = v_judged = zero
+                    share = _alpha(u, dy * dy * qv, opacity)
+                    beyond = _ONE / (_ONE - share)
+                    v_share = v_judged = zero
                     for k in range(first_prefix, last_prefix + 1):
                         at = k * BACKWARD_BLOCK + strip * STRIP_PIXELS + row * STRIP
                         before = load(scratch, at + LIGHT * PIXELS)
-                        weight = alpha * maximum(before, zero)
+                        weight = share * maximum(before, zero)
                         left = before - weight
                         going = left > _STOP
                         weight = select(going, weight, zero)
@@ -295,14 +320,14 @@ def composite_backward(
                         v1 = v1 + weight * g1
                         v2 = v2 + weight * g2
                         part = select(going, before * q - rest * beyond, zero)
-                        v_alpha = v_alpha + part
+                        v_share = v_share + part
                         if k == judged:
                             v_judged = part
-                    held = select(alpha < _ALPHA_MAX, alpha, zero)
-                    v_alpha, v_judged = v_alpha * held, v_judged * held
-                    s = s + v_alpha
-                    sy = sy + v_alpha * dy
-                    syy = syy + v_alpha * dy * dy
+                    held = select(share < _ALPHA_MAX, share, zero)
+                    v_share, v_judged = v_share * held, v_judged * held
+                    s = s + v_share
+                    sy = sy + v_share * dy
+                    syy = syy + v_share * dy * dy
                     r = r + v_judged
                     ry = ry + v_judged * dy
                     size = magnitude(v_judged)

@@ -110,6 +110,23 @@ def store(typingctx, array, index, value):
 
 
 @intrinsic
+def prefetch_to_write(typingctx, array, index):
+    """Ask for the cache line of the index-th number of a contiguous array, to be written soon."""
+
+    def build(context, builder, sig, args):
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        address = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
+        i32 = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [address.type, i32, i32, i32])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        # to write, into the second-level cache, data
+        builder.call(function, [address, i32(1), i32(2), i32(1)])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), build
+
+
+@intrinsic
 def lanes(typingctx, number):
     """All lanes equal to a float32."""
     return lanes_type(types.float32), lambda context, builder, sig, args: _broadcast(builder, args[0])

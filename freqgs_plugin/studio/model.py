@@ -179,14 +179,13 @@ class FreqSplatModel(SplatViews):
         self._begin_step(step)
 
     def _training_outputs(self, camera: Camera, background: Tensor, cam_idx: int | None) -> dict[str, Any]:
-        gaussians = self.gaussians()
+        gaussians = drawn = self.gaussians()
         rate = self.config.dropout
         if rate is None:
             rate = default_dropout(self.num_train_data)
         if rate > 0:
-            kept = drop_out(gaussians.opacities, rate, self.config.seed, self.step)
-            gaussians = replace(gaussians, opacities=kept)
-        renderings = self._training_renderings(gaussians, camera, background)
+            drawn = replace(gaussians, opacities=drop_out(gaussians.opacities, rate, self.config.seed, self.step))
+        renderings = self._training_renderings(drawn, camera, background)
         self._info = renderings[-1].info
         images = [r.features for r in renderings]
         if self.config.use_bilateral_grid and cam_idx is not None:
@@ -198,6 +197,7 @@ class FreqSplatModel(SplatViews):
             "accumulation": renderings[-1].alpha,
             "background": background,
             "info": self._info,
+            "gaussians": gaussians,
         }
 
     def _check_gradients(self, trainer: Any) -> None:
@@ -313,9 +313,9 @@ class FreqSplatModel(SplatViews):
         assert self._info is not None
         shown = self._info["radii"][0] > 0
         if self.config.opacity_penalty != 0:
-            losses["opacity"] = self.config.opacity_penalty * opacity_shown(self.opacities, shown)
+            losses["opacity"] = self.config.opacity_penalty * opacity_shown(outputs["gaussians"].opacities, shown)
         if self.config.size_penalty != 0:
-            losses["size"] = self.config.size_penalty * size_shown(self.scales, shown)
+            losses["size"] = self.config.size_penalty * size_shown(outputs["gaussians"].scales, shown)
         self.camera_optimizer.get_loss_dict(losses)
         if self.config.use_bilateral_grid:
             from nerfstudio.model_components.lib_bilagrid import total_variation_loss

@@ -13,11 +13,14 @@ class ViewTarget:
     """One view's image and mask at the stage's size, and their pyramid."""
 
     image: Tensor
+    """[h, w, 3]; without a mask it shares memory with the pyramid: planes, as rendered pictures are"""
     mask: Tensor | None
     pyramid: PyramidTargets
 
     def megabytes(self) -> float:
-        parts = [self.image, self.mask, self.pyramid.magnitudes, *self.pyramid.reduced]
+        parts = [self.mask, self.pyramid.magnitudes, *self.pyramid.reduced]
+        if self.mask is not None:
+            parts.append(self.image)
         return sum(p.numel() * p.element_size() for p in parts if p is not None) / 2**20
 
 
@@ -40,7 +43,10 @@ class TargetCache:
         if key is not None and key in self._kept:
             return self._kept[key]
         image, mask = make()
-        target = ViewTarget(image, mask, PyramidTargets.from_image(image, levels, mask, dft=dft))
+        pyramid = PyramidTargets.from_image(image, levels, mask, dft=dft)
+        if mask is None:
+            image = pyramid.reduced[-1][0].permute(1, 2, 0)
+        target = ViewTarget(image, mask, pyramid)
         if key is not None and self._used + target.megabytes() <= self._bound:
             self._kept[key] = target
             self._used += target.megabytes()

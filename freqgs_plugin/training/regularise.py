@@ -11,14 +11,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def opacity_shown(logits: Float[Tensor, "n 1"], shown: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-    """Sum of sigmoid(logits) over what is shown, divided by the number of all Gaussians; 0 without Gaussians."""
-    return (torch.sigmoid(logits) * shown[:, None]).sum() / max(len(logits), 1)
+def opacity_shown(opacities: Float[Tensor, " n"], shown: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+    """Sum of the opacities of what is shown, divided by the number of all Gaussians; 0 without Gaussians."""
+    return (opacities * shown).sum() / max(len(opacities), 1)
 
 
-def size_shown(log_scales: Float[Tensor, "n 3"], shown: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+def size_shown(scales: Float[Tensor, "n 3"], shown: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
     """Sum of the mean standard deviation over all axes, world units, divided and restricted likewise."""
-    return (torch.exp(log_scales) * shown[:, None]).sum() / max(log_scales.numel(), 1)
+    return (scales * shown[:, None]).sum() / max(scales.numel(), 1)
 
 
 FEW_VIEWS = 25

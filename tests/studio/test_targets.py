@@ -54,7 +54,7 @@ def test_memory_has_a_bound():
 
 def tensors(source):
     targets = PyramidTargets.from_image(source.image, 3)
-    return [source.image, targets.magnitudes, *targets.reduced]
+    return [targets.magnitudes, *targets.reduced]
 
 
 @pytest.mark.parametrize("mask", [False, True])
@@ -63,7 +63,7 @@ def test_targets_are_the_objectives(mask, dft):
     source = Source(mask=mask)
     target = TargetCache(1).get(0, source, 3, dft)
     expected = PyramidTargets.from_image(source.image, 3, source.mask, dft=dft)
-    assert target.image is source.image and target.mask is source.mask
+    assert torch.equal(target.image, source.image) and target.mask is source.mask
     assert all(map(torch.equal, target.pyramid.reduced, expected.reduced))
     assert (target.pyramid.magnitudes is None) == (not dft)
     if dft:

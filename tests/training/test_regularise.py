@@ -9,27 +9,27 @@ ALL = torch.tensor([True, True])
 
 
 def test_penalties_are_means_of_what_is_drawn():
-    logits = torch.tensor([[0.0], [torch.logit(torch.tensor(0.9))]])
-    scales = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    assert opacity_shown(logits, ALL).item() == pytest.approx(0.7)
-    assert size_shown(scales, ALL).item() == pytest.approx((1 + 2.718281828) / 2)
+    opacities = torch.tensor([0.5, 0.9])
+    scales = torch.tensor([[1.0, 1.0, 1.0], [1.0, 2.0, 6.0]])
+    assert opacity_shown(opacities, ALL).item() == pytest.approx(0.7)
+    assert size_shown(scales, ALL).item() == pytest.approx(2)
     first = torch.tensor([True, False])
-    assert opacity_shown(logits, first).item() == pytest.approx(0.25)
+    assert opacity_shown(opacities, first).item() == pytest.approx(0.25)
     assert size_shown(scales, first).item() == pytest.approx(0.5)
 
 
 def test_penalties_push_down_what_is_shown_and_nothing_else():
-    logits, scales = torch.zeros(2, 1, requires_grad=True), torch.zeros(2, 3, requires_grad=True)
+    opacities, scales = torch.zeros(2, requires_grad=True), torch.zeros(2, 3, requires_grad=True)
     shown = torch.tensor([True, False])
-    (opacity_shown(logits, shown) + size_shown(scales, shown)).backward()
-    assert logits.grad is not None and scales.grad is not None
-    assert bool((logits.grad[0] > 0).all()) and bool((scales.grad[0] > 0).all())
-    assert bool((logits.grad[1] == 0).all()) and bool((scales.grad[1] == 0).all())
+    (opacity_shown(opacities, shown) + size_shown(scales, shown)).backward()
+    assert opacities.grad is not None and scales.grad is not None
+    assert bool((opacities.grad[0] > 0).all()) and bool((scales.grad[0] > 0).all())
+    assert bool((opacities.grad[1] == 0).all()) and bool((scales.grad[1] == 0).all())
 
 
 def test_no_gaussians_cost_nothing():
     none = torch.zeros(0, dtype=torch.bool)
-    assert opacity_shown(torch.zeros(0, 1), none).item() == 0
+    assert opacity_shown(torch.zeros(0), none).item() == 0
     assert size_shown(torch.zeros(0, 3), none).item() == 0
     assert drop_out(torch.zeros(0), 0.5, 1, 2).shape == (0,)
 
