@@ -11,10 +11,7 @@ summed over rows as sums of v, v dy, v dy^2 per lane, which dx completes once pe
 
 import numpy as np
 
-from freqgs_plugin.functional.numba_threads import njit, prange
-from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from freqgs_plugin.rendering.numba_binning import STRIP, TILE
-from freqgs_plugin.rendering.numba_lanes import (
+from freqgs_plugin.functional.numba_lanes import (
     LANES,
     any_set,
     lanes,
@@ -26,6 +23,9 @@ from freqgs_plugin.rendering.numba_lanes import (
     store,
     total,
 )
+from freqgs_plugin.functional.numba_threads import njit, prange
+from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from freqgs_plugin.rendering.numba_binning import STRIP, TILE
 from freqgs_plugin.rendering.numba_projection import (
     ABS_X,
     ABS_Y,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from freqgs_plugin.functional.numba_threads import njit
-from freqgs_plugin.rendering.numba_lanes import (
+from freqgs_plugin.functional.numba_lanes import (
     LANES,
     any_set,
     lanes,
@@ -16,8 +15,7 @@ from freqgs_plugin.rendering.numba_lanes import (
     store,
     total,
 )
-
-f4 = np.float32
+from freqgs_plugin.functional.numba_threads import njit
 
 
 @njit(error_model="numpy")
@@ -38,7 +36,7 @@ def _apply(a, b, number, out):
 
 @njit(error_model="numpy")
 def _total_and_any(a, bound):
-    sums = lanes(f4(0))
+    sums = lanes(a.dtype.type(0))
     found = False
     for i in range(0, len(a), LANES):
         sums = sums + load(a, i)
@@ -46,29 +44,30 @@ def _total_and_any(a, bound):
     return total(sums), found
 
 
-@pytest.fixture
-def pair() -> tuple[np.ndarray, np.ndarray]:
+@pytest.fixture(params=[np.float32, np.float64])
+def pair(request: pytest.FixtureRequest) -> tuple[np.ndarray, np.ndarray]:
     generator = np.random.default_rng(0)
-    a, b = generator.normal(size=(2, 4 * LANES)).astype(f4)
+    a, b = generator.normal(size=(2, 4 * LANES)).astype(request.param)
     b[::5] = a[::5]
     return a, b
 
 
 def test_each_operation_is_numpys(pair: tuple[np.ndarray, np.ndarray]):
     a, b = pair
-    number = f4(0.25)
-    out = np.zeros((10, len(a)), f4)
+    number = a.dtype.type(0.25)
+    out = np.zeros((10, len(a)), a.dtype)
     _apply(a, b, number, out)
     expected = [
         a + b, a - number, number * b, a / b, np.minimum(a, b), np.maximum(a, b), np.abs(a),
         np.where(a > b, a, number), np.where(a >= b, a, number), np.where(a < number, a, b),
     ]  # fmt: skip
-    np.testing.assert_allclose(out, expected, rtol=1e-6)
+    np.testing.assert_allclose(out, expected, rtol=8 * np.finfo(a.dtype).eps)
 
 
 @pytest.mark.parametrize("position", [0, LANES - 1, 2 * LANES + 3])
-def test_total_and_any_see_every_lane(position: int):
-    a = np.ones(4 * LANES, f4)
-    assert _total_and_any(a, f4(1)) == (4 * LANES, False)
+@pytest.mark.parametrize("scalar", [np.float32, np.float64])
+def test_total_and_any_see_every_lane(position: int, scalar: type):
+    a = np.ones(4 * LANES, scalar)
+    assert _total_and_any(a, scalar(1)) == (4 * LANES, False)
     a[position] = 2
-    assert _total_and_any(a, f4(1)) == (4 * LANES + 1, True)
+    assert _total_and_any(a, scalar(1)) == (4 * LANES + 1, True)
