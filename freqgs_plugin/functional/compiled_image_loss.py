@@ -2,39 +2,38 @@
 
 import numpy as np
 import torch
+from numba import get_num_threads
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from freqgs_plugin.functional.compiled_rows import row_sum
 from freqgs_plugin.functional.image_loss import C1, C2, TAPS
+from freqgs_plugin.functional.numba_lanes import LANES, lanes, load, maximum, store
 from freqgs_plugin.functional.numba_threads import njit, prange
 
-_STRIP = 32
-"""rows that one thread takes at a time: four blurred maps of a strip stay in the second-level cache"""
+_REACH = TAPS - 1
+_BLOCK = 4
+"""rows that are blurred downwards together, so that each of the 14 below one another is read once"""
+_CHUNK = 32
+"""rows that go through all steps together: the blurred maps of so many and `_REACH` stay in the second-level cache"""
+_DEEP = _CHUNK + _REACH
+_LEAD = 12
+"""rows that a strip computes again above itself: at least `_REACH`, a multiple of `_BLOCK`"""
 
 
 class CompiledImageSums(torch.autograd.Function):
     """`by_ssim` * (sum of SSIM over windows) + `by_l1` * (sum of |x - y|), of planes `[p h w]`.
 
-    11 taps per axis. The gradient for the first image is made in the forward pass, where it or L1 is wanted.
-    `centres` [2, p] are subtracted from the planes of both images before SSIM: see `image_loss`.
+    11 taps per axis; a plane has `pixels` of its own, and zeros around them. The gradient for x is made in the forward
+    pass.
     """
 
     @staticmethod
-    def forward(ctx, x, y, rows, columns, centres, by_ssim, by_l1):
-        x, y = x.detach(), y.detach()
-        planes, height, width = x.shape
-        pair, scalar = (x.numpy(), y.numpy()), x.numpy().dtype.type
-        taps = rows.astype(scalar), columns.astype(scalar)
-        similarity = np.empty((planes, -(-(height - TAPS + 1) // _STRIP)))
-        distance = np.zeros((planes, -(-height // _STRIP)))
-        # derivatives by mean_x, mean_xx and mean_xy per window, with the zeros around that their blur backwards needs
-        slopes = np.zeros((3, planes, height + TAPS - 1, width + TAPS - 1), scalar)
-        _similarity(*pair, *taps, centres.numpy(), similarity, slopes)
-        if ctx.needs_input_grad[0] or by_l1 != 0:
-            gradient = torch.empty_like(x)
-            _gradient(*pair, *taps, centres.numpy(), slopes, scalar(by_ssim), scalar(by_l1), distance, gradient.numpy())
-            ctx.save_for_backward(gradient)
-        return x.new_tensor(by_ssim * similarity.sum() + by_l1 * distance.sum())
+    def forward(ctx, x, y, rows, columns, pixels, by_ssim, by_l1):
+        weights = by_ssim, by_l1
+        value, gradient = image_sums(x.detach(), y.detach(), rows, columns, pixels, *weights, ctx.needs_input_grad[0])
+        ctx.save_for_backward(gradient)
+        return x.new_tensor(value)
 
     @staticmethod
     @once_differentiable
@@ -42,113 +41,215 @@ class CompiledImageSums(torch.autograd.Function):
         return ctx.saved_tensors[0] * upstream, None, None, None, None, None, None
 
 
-@njit(fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-def _blur_along(line, taps, out):
-    t0, t1, t2, t3, t4, t5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
-    for j in range(out.size):
-        near = t3 * (line[j + 3] + line[j + 7]) + t4 * (line[j + 4] + line[j + 6]) + t5 * line[j + 5]
-        far = t0 * (line[j] + line[j + 10]) + t1 * (line[j + 1] + line[j + 9]) + t2 * (line[j + 2] + line[j + 8])
-        out[j] = near + far
+def image_sums(
+    x: Tensor, y: Tensor, rows: np.ndarray, columns: np.ndarray, pixels: int, by_ssim: float, by_l1: float,
+    wants_gradient: bool,
+) -> tuple[float, Tensor]:  # fmt: skip
+    """Value of `CompiledImageSums`, and its gradient for x (empty where it is not wanted)."""
+    planes, height, _ = x.shape
+    pair, scalar = (x.numpy(), y.numpy()), x.numpy().dtype.type
+    taps = tuple(rows[:6].astype(scalar)), tuple(columns[:6].astype(scalar))
+    # a plane's mean is subtracted before SSIM: variances of bright flat ones are differences of large squares
+    totals, sums = np.empty((2, planes, height)), np.zeros((2, planes, height))
+    _row_sums(*pair, totals)
+    gradient = torch.empty_like(x if wants_gradient else x[:0])
+    # two strips per thread, each a multiple of the block: where they end changes no bits
+    strips = 1 if get_num_threads() == 1 else max(1, -(-2 * get_num_threads() // planes))
+    strip = max(_CHUNK, -(-height // (strips * _BLOCK)) * _BLOCK)
+    _compare(
+        *pair,
+        *taps,
+        (totals.sum(2) / pixels).astype(scalar),
+        scalar(by_ssim),
+        scalar(by_l1),
+        strip,
+        sums,
+        gradient.numpy(),
+    )
+    return by_ssim * sums[0].sum() + by_l1 * sums[1].sum(), gradient
 
 
-@njit(fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-def _blur_across(lines, taps, out):
-    t0, t1, t2, t3, t4, t5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
-    for j in range(out.size):
-        near = t3 * (lines[3, j] + lines[7, j]) + t4 * (lines[4, j] + lines[6, j]) + t5 * lines[5, j]
-        far = t0 * (lines[0, j] + lines[10, j]) + t1 * (lines[1, j] + lines[9, j]) + t2 * (lines[2, j] + lines[8, j])
-        out[j] = near + far
+@njit(parallel=True, error_model="numpy", cache=True, nogil=True)
+def _row_sums(x, y, sums):
+    planes, height, _ = x.shape
+    for task in prange(planes * height):
+        p, row = task // height, task % height
+        sums[0, p, row], sums[1, p, row] = row_sum(x[p, row]), row_sum(y[p, row])
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def _moments_of_row(x, y, centre_x, centre_y, centred_x, centred_y, squares, products):
-    """What is blurred: x and y without their centres, x^2 + y^2 and x y of those."""
+def _weighted(taps, a, b, c, d, e, f, g, h, i, j, k):
+    near = taps[3] * (d + h) + taps[4] * (e + g) + taps[5] * f
+    return taps[0] * (a + k) + taps[1] * (b + j) + taps[2] * (c + i) + near
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def _blur_along(source, at, taps, out, to, count):
+    """out[to + v] = the 11 numbers from source[at + v] weighted, for v < count and up to a multiple of LANES."""
+    for v in range(0, count, LANES):
+        s = at + v
+        a, b, c, d = load(source, s), load(source, s + 1), load(source, s + 2), load(source, s + 3)
+        e, f, g, h = load(source, s + 4), load(source, s + 5), load(source, s + 6), load(source, s + 7)
+        i, j, k = load(source, s + 8), load(source, s + 9), load(source, s + 10)
+        store(out, to + v, _weighted(taps, a, b, c, d, e, f, g, h, i, j, k))
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def _blur_down(source, at, taps, out, to, pitch, count):
+    """As `_blur_along`, of 11 numbers below one another: `_BLOCK` rows `pitch` apart."""
+    for v in range(0, count, LANES):
+        s, t = at + v, to + v
+        a, b = load(source, s), load(source, s + pitch)
+        c, d = load(source, s + 2 * pitch), load(source, s + 3 * pitch)
+        e, f = load(source, s + 4 * pitch), load(source, s + 5 * pitch)
+        g, h = load(source, s + 6 * pitch), load(source, s + 7 * pitch)
+        i, j = load(source, s + 8 * pitch), load(source, s + 9 * pitch)
+        k, m = load(source, s + 10 * pitch), load(source, s + 11 * pitch)
+        n, o = load(source, s + 12 * pitch), load(source, s + 13 * pitch)
+        store(out, t, _weighted(taps, a, b, c, d, e, f, g, h, i, j, k))
+        store(out, t + pitch, _weighted(taps, b, c, d, e, f, g, h, i, j, k, m))
+        store(out, t + 2 * pitch, _weighted(taps, c, d, e, f, g, h, i, j, k, m, n))
+        store(out, t + 3 * pitch, _weighted(taps, d, e, f, g, h, i, j, k, m, n, o))
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def _moments_of_row(x, y, centre_x, centre_y, lines, pitch):
+    """What is blurred: x and y without their centres, x^2 + y^2 and x y of those. Returns the sum of |x - y|."""
+    centred_x, centred_y = lines[:pitch], lines[pitch : 2 * pitch]
+    squares, products, distance = lines[2 * pitch : 3 * pitch], lines[3 * pitch : 4 * pitch], lines[4 * pitch :]
     for j in range(x.size):
         a, b = x[j] - centre_x, y[j] - centre_y
         centred_x[j], centred_y[j] = a, b
         squares[j], products[j] = a * a + b * b, a * b
+        distance[j] = abs(x[j] - y[j])
+    return row_sum(distance[: x.size])
 
 
-@njit(fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-def _similarity_of_row(x, y, squares, products, centre_x, centre_y, by_x, by_xx, by_xy, out):
-    """SSIM of one row of windows from the four blurred maps, and its derivatives by the means of x, x^2 and x y."""
-    scalar = x.dtype.type
+@njit(error_model="numpy", cache=True, nogil=True)
+def _similarity_of_row(maps, at, step, centre_x, centre_y, slopes, pitch, count):
+    """SSIM of one row of windows from the four blurred maps, `step` apart, put behind its three derivatives.
+
+    `slopes`: derivatives by the means of x, x^2 and x y, with `_REACH` zeros on both sides, then SSIM, `pitch` apart.
+    """
+    scalar = maps.dtype.type
     zero, one, two, c1, c2 = scalar(0), scalar(1), scalar(2), scalar(C1), scalar(C2)
-    for j in range(out.size):
-        dx, dy = x[j], y[j]
+    for j in range(0, count, LANES):
+        n, to = at + j, _REACH + j
+        dx, dy = load(maps, n), load(maps, n + step)
         a, b = dx + centre_x, dy + centre_y
         per_luminance = one / (a * a + b * b + c1)
-        variances = max(squares[j] - dx * dx - dy * dy, zero)
+        # rounding must not make the variances negative, or the denominator could vanish
+        variances = maximum(load(maps, n + 2 * step) - dx * dx - dy * dy, lanes(zero))
         per_variance = one / (variances + c2)
         luminance = (two * a * b + c1) * per_luminance
-        structure = (two * (products[j] - dx * dy) + c2) * per_variance
+        structure = (two * (load(maps, n + 3 * step) - dx * dy) + c2) * per_variance
         value = luminance * structure
-        out[j] = value
-        by_xy[j] = two * luminance * per_variance
-        by_xx[j] = -value * per_variance
-        by_x[j] = two * ((b * structure - a * value) * per_luminance + (dx * value - dy * luminance) * per_variance)
-
-
-@njit(parallel=True, fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-def _similarity(x, y, rows, columns, centres, sums, slopes):
-    """Per strip of windows: blur the moments along every row, then down the strip, then SSIM and derivatives."""
-    planes, height, width = x.shape
-    strips, wide, tall = sums.shape[1], width - 10, height - 10
-    for task in prange(planes * strips):
-        p, top = task // strips, task % strips * _STRIP
-        count = min(_STRIP, tall - top)
-        blurred = np.empty((4, count + 10, wide), x.dtype)
-        lines = np.empty((4, width), x.dtype)
-        maps = np.empty((5, wide), x.dtype)
-        total = 0.0
-        for i in range(count + 10):
-            row = top + i
-            _moments_of_row(x[p, row], y[p, row], centres[0, p], centres[1, p], lines[0], lines[1], lines[2], lines[3])
-            for c in range(4):
-                _blur_along(lines[c], columns, blurred[c, i])
-        for i in range(count):
-            for c in range(4):
-                _blur_across(blurred[c, i : i + 11], rows, maps[c])
-            # one row of each, not a row of all three: that would be strided, and the loop over it not vectorised
-            by_x = slopes[0, p, top + i + 10, 10 : 10 + wide]
-            by_xx = slopes[1, p, top + i + 10, 10 : 10 + wide]
-            by_xy = slopes[2, p, top + i + 10, 10 : 10 + wide]
-            _similarity_of_row(
-                maps[0], maps[1], maps[2], maps[3], centres[0, p], centres[1, p], by_x, by_xx, by_xy, maps[4]
-            )
-            total += row_sum(maps[4])
-        sums[p, task % strips] = total
+        by_x = two * ((b * structure - a * value) * per_luminance + (dx * value - dy * luminance) * per_variance)
+        store(slopes, to, by_x)
+        store(slopes, to + pitch, (zero - value) * per_variance)
+        store(slopes, to + 2 * pitch, two * luminance * per_variance)
+        store(slopes, to + 3 * pitch, value)
+    for c in range(4):
+        slopes[c * pitch + _REACH + count : (c + 1) * pitch] = zero
+    return row_sum(slopes[3 * pitch + _REACH : 3 * pitch + _REACH + count])
 
 
 @njit(fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-def _gradient_of_row(by_x, by_xx, by_xy, x, y, centre_x, centre_y, by_ssim, by_l1, distance, out):
-    """|x - y|, and the weighted gradient of both terms; 0 for the distance where x = y."""
+def _gradient_of_row(maps, step, x, y, centre_x, centre_y, by_ssim, by_l1, out):
+    """d/dx = by_x + 2 x by_xx + y by_xy, x and y centred, plus that of L1, which is 0 where x = y."""
+    by_x, by_xx, by_xy = maps[: x.size], maps[step : step + x.size], maps[2 * step : 2 * step + x.size]
     two = x.dtype.type(2)
-    for j in range(out.size):
-        difference = x[j] - y[j]
-        distance[j] = abs(difference)
+    for j in range(x.size):
         ssim = by_x[j] + two * (x[j] - centre_x) * by_xx[j] + (y[j] - centre_y) * by_xy[j]
-        out[j] = by_ssim * ssim + by_l1 * np.sign(difference)
+        out[j] = by_ssim * ssim + by_l1 * np.sign(x[j] - y[j])
 
 
-@njit(parallel=True, fastmath={"contract"}, error_model="numpy", cache=True, nogil=True)
-def _gradient(x, y, rows, columns, centres, slopes, by_ssim, by_l1, sums, out):
-    """Blurs the three derivative maps back onto the pixels: d/dx = by_x + 2 x by_xx + y by_xy, x and y centred."""
+@njit(error_model="numpy", cache=True, nogil=True)
+def _add_moments(x, y, first, count, slot, taps, centres, lines, blurred, pitch, sums):
+    """Blur the moments of `count` rows along them into the rows from `slot` of the four maps; zeros below the image."""
+    for i in range(count):
+        row = first + i
+        if row < len(x):
+            sums[row] = _moments_of_row(x[row], y[row], centres[0], centres[1], lines, pitch)
+        for c in range(4):
+            to = (c * _DEEP + slot + i) * pitch
+            if row < len(x):
+                _blur_along(lines, c * pitch, taps, blurred, to, x.shape[1] - _REACH)
+            else:
+                blurred[to : to + pitch] = 0
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def _add_slopes(blurred, first, count, shape, rows, columns, centres, maps, slopes, back, pitch, sums):
+    """SSIM of `count` rows of windows, and its derivatives blurred along them into the maps `back`; zeros below."""
+    tall, width, step = shape[0] - _REACH, shape[1], _BLOCK * pitch
+    for i in range(0, count, _BLOCK):
+        for c in range(4):
+            _blur_down(blurred, (c * _DEEP + i) * pitch, rows, maps, c * step, pitch, width - _REACH)
+        for k in range(_BLOCK):
+            row = first + i + k
+            if row < tall:
+                sums[row] = _similarity_of_row(
+                    maps, k * pitch, step, centres[0], centres[1], slopes, pitch, width - _REACH
+                )
+            for c in range(3):
+                to = (c * _DEEP + _REACH + i + k) * pitch
+                if row < tall:
+                    _blur_along(slopes, c * pitch, columns, back, to, width)
+                else:
+                    back[to : to + pitch] = 0
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def _write_gradient(x, y, back, i, taps, centres, by_ssim, by_l1, maps, pitch, out):
+    """The gradient of up to `_BLOCK` rows, from the i-th row of `back` on."""
+    step = _BLOCK * pitch
+    for c in range(3):
+        _blur_down(back, (c * _DEEP + i) * pitch, taps, maps, c * step, pitch, x.shape[1])
+    for k in range(len(x)):
+        line = maps[k * pitch :]
+        _gradient_of_row(line, step, x[k], y[k], centres[0], centres[1], by_ssim, by_l1, out[k])
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def _keep_last(maps, count, pitch):
+    """Move the last `_REACH` rows of each of `count` maps to its beginning."""
+    for c in range(count):
+        first = c * _DEEP * pitch
+        last = first + _CHUNK * pitch
+        maps[first : first + _REACH * pitch] = maps[last : last + _REACH * pitch]
+
+
+@njit(parallel=True, error_model="numpy", cache=True, nogil=True)
+def _compare(x, y, rows, columns, centres, by_ssim, by_l1, strip, sums, out):
+    """Sums per row: `sums[0]` of SSIM, by a window's first row, and `sums[1]` of |x - y|; the gradient unless empty.
+
+    By strips of rows, and within a strip by chunks: blur the moments along every row, then downwards; SSIM and its
+    derivatives by the moments; those blurred back onto the pixels along every row, then downwards.
+    """
     planes, height, width = x.shape
-    strips = sums.shape[1]
+    strips = -(-height // strip)
+    # an odd number of vectors: rows a power of two apart would compete for the same places of the cache
+    pitch = ((width + _REACH) // LANES + 2 | 1) * LANES
     for task in prange(planes * strips):
-        p, top = task // strips, task % strips * _STRIP
-        count = min(_STRIP, height - top)
-        blurred = np.empty((3, count + 10, width), x.dtype)
-        maps = np.empty((4, width), x.dtype)
-        total = 0.0
-        for i in range(count + 10):
-            for c in range(3):
-                _blur_along(slopes[c, p, top + i], columns, blurred[c, i])
-        for i in range(count):
-            for c in range(3):
-                _blur_across(blurred[c, i : i + 11], rows, maps[c])
-            a, b, o = x[p, top + i], y[p, top + i], out[p, top + i]
-            _gradient_of_row(maps[0], maps[1], maps[2], a, b, centres[0, p], centres[1, p], by_ssim, by_l1, maps[3], o)
-            total += row_sum(maps[3])
-        sums[p, task % strips] = total
+        p, top = task // strips, task % strips * strip
+        a, b, centre, bottom = x[p], y[p], centres[:, p], min(top + strip, height)
+        lines, slopes = np.zeros(5 * pitch, x.dtype), np.zeros(4 * pitch, x.dtype)
+        blurred, back = np.empty(4 * _DEEP * pitch, x.dtype), np.zeros(3 * _DEEP * pitch, x.dtype)
+        maps = np.empty(4 * _BLOCK * pitch, x.dtype)
+        start = max(top - _LEAD, 0)
+        _add_moments(a, b, start, _REACH, 0, columns, centre, lines, blurred, pitch, sums[1, p])
+        for first in range(start, bottom, _CHUNK):
+            count = min(_CHUNK, -(-(bottom - first) // _BLOCK) * _BLOCK)
+            _add_moments(a, b, first + _REACH, count, _REACH, columns, centre, lines, blurred, pitch, sums[1, p])
+            _add_slopes(
+                blurred, first, count, a.shape, rows, columns, centre, maps, slopes, back, pitch, sums[0, p]
+            )  # fmt: skip
+            end = min(first + count, bottom) if len(out) > 0 else 0
+            for row in range(max(first, top), end, _BLOCK):
+                block = slice(row, min(row + _BLOCK, end))
+                _write_gradient(
+                    a[block], b[block], back, row - first, rows, centre, by_ssim, by_l1, maps, pitch, out[p, block]
+                )
+            _keep_last(blurred, 4, pitch)
+            _keep_last(back, 3, pitch)

@@ -97,16 +97,16 @@ def _compiled_sums(pred: Tensor, target: Tensor, by_ssim: float, by_l1: float) -
     """`by_ssim` times the sum of SSIM over all windows and `by_l1` times that of |pred - target|, by compiled loops."""
     from freqgs_plugin.functional.compiled_image_loss import CompiledImageSums
 
-    centres = torch.stack([_plane_means(image) for image in (pred, target)]).view(2, -1)
     height, width = pred.shape[-2:]
     rows, columns = _window(height), _window(width)
     # a shorter window is an 11-tap one with zeros around it, over an image with as many zeros around it
+    pixels = height * width
     edge = ((TAPS - columns.size) // 2,) * 2 + ((TAPS - rows.size) // 2,) * 2
     if any(edge):
         pred, target = F.pad(pred, edge), F.pad(target, edge)
     pred, target = pred.flatten(0, 1).contiguous(), target.flatten(0, 1).contiguous()
     padded = [np.pad(taps, (TAPS - taps.size) // 2) for taps in (rows, columns)]
-    return CompiledImageSums.apply(pred, target, *padded, centres, by_ssim, by_l1)
+    return CompiledImageSums.apply(pred, target, *padded, pixels, by_ssim, by_l1)
 
 
 def _plane_means(image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c 1 1"]:

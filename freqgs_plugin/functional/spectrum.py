@@ -5,6 +5,7 @@ as it occurs in the full plane, so they equal those over `fft2` for even and odd
 pixel. Half precision is raised to float32: a sum over 10^5 pixels has no place in 10 bits.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -38,22 +39,28 @@ def magnitude_distance(
 
 
 def magnitude_distance_to(
-    pred: Float[Tensor, "*batch h w"],
+    pred: Float[Tensor, "*batch h w"] | Sequence[Float[Tensor, "_ *rest h w"]],
     target_magnitude: Float[Tensor, "*batch h w2"],
     norm: Literal["backward", "ortho"] = "backward",
 ) -> Float[Tensor, ""]:
-    """`magnitude_distance` to an image of which only `magnitude(target)` is kept, unnormalised whatever `norm` is."""
-    height, width = pred.shape[-2:]
-    expected = (*pred.shape[:-1], width // 2 + 1)
+    """`magnitude_distance` to an image of which only `magnitude(target)` is kept, unnormalised whatever `norm` is.
+
+    Several `pred` count as one, concatenated along the first axis; on CPU that copies nothing.
+    """
+    preds = [pred] if isinstance(pred, Tensor) else list(pred)
+    shape = preds[0].shape if len(preds) == 1 else (sum(map(len, preds)), *preds[0].shape[1:])
+    height, width = shape[-2:]
+    expected = (*shape[:-1], width // 2 + 1)
     if tuple(target_magnitude.shape) != expected:
         got = tuple(target_magnitude.shape)
-        raise ValueError(f"magnitudes of {tuple(pred.shape)} images have shape {expected}, got {got}.")
-    pred = _at_least_float32(pred)
-    if pred.device.type == "cpu" and not target_magnitude.requires_grad:
+        raise ValueError(f"magnitudes of {tuple(shape)} images have shape {expected}, got {got}.")
+    preds = [_at_least_float32(image) for image in preds]
+    if preds[0].device.type == "cpu" and not target_magnitude.requires_grad:
         from freqgs_plugin.functional.compiled_spectrum import CompiledDistance
 
-        distance = CompiledDistance.apply(pred, target_magnitude)
+        distance = CompiledDistance.apply(target_magnitude, *preds)
     else:
+        pred = torch.cat(preds) if len(preds) > 1 else preds[0]
         with torch.autocast(pred.device.type, enabled=False):
             difference = (_differentiable_magnitude(pred) - target_magnitude).abs().flatten(0, -2).sum(0)
             distance = (difference * _occurrences(width, difference)).sum() / pred.numel()

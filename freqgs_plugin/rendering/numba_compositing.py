@@ -11,10 +11,7 @@ summed over rows as sums of v, v dy, v dy^2 per lane, which dx completes once pe
 
 import numpy as np
 
-from freqgs_plugin.functional.numba_threads import njit, prange
-from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from freqgs_plugin.rendering.numba_binning import BOX, ID, SLOT, STRIP, TILE
-from freqgs_plugin.rendering.numba_lanes import (
+from freqgs_plugin.functional.numba_lanes import (
     LANES,
     any_set,
     lanes,
@@ -27,6 +24,9 @@ from freqgs_plugin.rendering.numba_lanes import (
     store,
     store_totals,
 )
+from freqgs_plugin.functional.numba_threads import njit, prange
+from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from freqgs_plugin.rendering.numba_binning import BOX, ID, SLOT, STRIP, TILE
 from freqgs_plugin.rendering.numba_projection import OPACITY, V_COLUMNS, S, U, V, X, Y
 
 ROWS = LANES // STRIP

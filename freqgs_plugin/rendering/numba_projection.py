@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 
+from freqgs_plugin.functional.numba_lanes import TOTALS, add_row
 from freqgs_plugin.functional.numba_threads import njit, prange
 from freqgs_plugin.functional.projection import QUATERNION_MIN, STD_MAX
 from freqgs_plugin.rendering.base import ALPHA_MIN, FOV_MARGIN, NEAR_PLANE, RADIUS_SIGMAS
-from freqgs_plugin.rendering.numba_lanes import TOTALS, add_row
 
 # columns of a projected Gaussian: centre (px), its falloff exp(-(U dx + S dy)^2 - V dy^2), opacity after compensation,
 # and the half-width and half-height (px) of the ellipse on which alpha >= ALPHA_MIN

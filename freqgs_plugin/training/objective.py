@@ -96,7 +96,7 @@ def pyramid_objective(
         if targets.magnitudes is None:
             raise ValueError("targets lack DFT magnitudes. Make them with `dft=True`, or call with `dft=False`.")
         # the mean over the stacked levels, times their number, is the sum of Eq. 8
-        distance = magnitude_distance_to(torch.cat(renders[:-1]), targets.magnitudes, dft_norm)
+        distance = magnitude_distance_to(renders[:-1], targets.magnitudes, dft_norm)
         terms["dft"] = dft_weight * (m - 1) * distance
     return terms
 

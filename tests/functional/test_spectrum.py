@@ -110,6 +110,19 @@ def test_non_contiguous_images():
     assert magnitude_distance(a, b).item() == pytest.approx(full_plane_distance(a, b), rel=1e-10)
 
 
+@pytest.mark.parametrize("counts", [(1,), (1, 1), (2, 1, 3)])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_several_images_count_as_their_concatenation(counts, channels):
+    images = [noise(n, channels, 9, 12, seed=i).requires_grad_() for i, n in enumerate(counts)]
+    target = magnitude(noise(sum(counts), channels, 9, 12, seed=9))
+    together, apart = magnitude_distance_to(torch.cat(images), target), magnitude_distance_to(images, target)
+    assert apart.item() == together.item()
+    for one, other in zip(torch.autograd.grad(together, images), torch.autograd.grad(apart, images), strict=True):
+        assert torch.equal(one, other)
+    plain = magnitude_distance_to(images, target.requires_grad_())
+    assert plain.item() == pytest.approx(apart.item(), rel=1e-12)
+
+
 def test_wrong_target_shape_is_named():
     with pytest.raises(ValueError, match=r"\(1, 3, 8, 5\), got \(1, 3, 8, 4\)"):
         magnitude_distance_to(noise(1, 3, 8, 8), noise(1, 3, 8, 4))

@@ -121,9 +121,9 @@ def _exact_alpha() -> Any:
     from llvmlite import ir
     from numba.core import cgutils
 
+    from freqgs_plugin.functional.numba_lanes import LANES, intrinsic, lanes, lanes_type, minimum, select
     from freqgs_plugin.functional.numba_threads import njit
     from freqgs_plugin.rendering.base import ALPHA_MAX, ALPHA_MIN
-    from freqgs_plugin.rendering.numba_lanes import LANES, intrinsic, lanes, lanes_type, minimum, select
 
     f4 = np.float32
     zero, most, least, scale = f4(0), f4(ALPHA_MAX), f4(ALPHA_MIN), f4(16)

@@ -1,9 +1,9 @@
-"""Several float32 numbers as one value in compiled kernels: LLVM's own vectors, so that speed does not hang on what its
-loop vectoriser makes of a loop.
+"""Several numbers as one value in compiled kernels: LLVM's own vectors, so that speed does not hang on what its loop
+vectoriser makes of a loop.
 
-`Lanes` are added, subtracted, multiplied, divided and compared with Lanes or float32, elementwise; a comparison gives a
-mask. Arithmetic assumes finite numbers and may be reordered, as numba's `fastmath` does. On a CPU whose
-registers are narrower LLVM splits the vectors.
+`Lanes` are of float32 or float64. They are added, subtracted, multiplied, divided and compared with Lanes or numbers of
+that type, elementwise; a comparison gives a mask. Arithmetic assumes finite numbers and may be reordered, as numba's
+`fastmath` does. On a CPU whose registers are narrower LLVM splits the vectors.
 """
 
 import operator
@@ -19,10 +19,9 @@ from numba.extending import intrinsic as _intrinsic
 from numba.extending import lower_builtin, lower_cast, models, register_model
 
 LANES = 16 if get_host_cpu_features().get("avx512f") else 8
-"""numbers in one value: what one register holds"""
+"""numbers in one value: as many float32 as one register holds, and of float64 what two hold"""
 
 _FLAGS = ("reassoc", "contract", "nsz", "arcp", "nnan", "ninf")
-_FLOATS, _BITS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(1), LANES)
 
 
 def intrinsic(function: Any) -> Any:
@@ -31,71 +30,86 @@ def intrinsic(function: Any) -> Any:
 
 
 class _Vector(types.Type):
-    """Type of Lanes (`float32 lanes`) or of a mask (`bool lanes`)."""
+    """Type of Lanes of `element`, or of a mask (boolean)."""
+
+    def __init__(self, element: Any):
+        super().__init__(f"{element}x{LANES}")
+        self.element = element
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
         from numba.core.typeconv import Conversion
 
-        return Conversion.promote if self is lanes_type and other == types.float32 else None
+        return Conversion.promote if self is not mask_type and other == self.element else None
 
 
-lanes_type, mask_type = _Vector(f"float32x{LANES}"), _Vector(f"boolx{LANES}")
+lanes_type, mask_type = _Vector(types.float32), _Vector(types.boolean)
+_KINDS = {types.float32: lanes_type, types.float64: _Vector(types.float64)}
+_IR = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.boolean: ir.IntType(1)}
+
+
+def _ir(kind: Any) -> ir.VectorType:
+    return ir.VectorType(_IR[kind.element], LANES)
 
 
 @register_model(_Vector)
 class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: _Vector):
-        super().__init__(manager, kind, _FLOATS if kind.name == lanes_type.name else _BITS)
+        super().__init__(manager, kind, _ir(kind))
 
 
 def _broadcast(builder: Any, number: Any) -> Any:
-    vector = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
-    first = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    return builder.shuffle_vector(vector, ir.Constant(_FLOATS, ir.Undefined), first)
+    none = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
+    vector = builder.insert_element(none, number, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(vector, none, ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES))
 
 
-@lower_cast(types.float32, lanes_type)
-def _(context, builder, source, target, value):  # pyright: ignore[reportUnusedParameter]
-    return _broadcast(builder, value)
-
-
-def _elementwise(operation: Any, result: _Vector, build: Any) -> None:
-    """Teach numba `operation` on two Lanes, or Lanes and a float32."""
+def _elementwise(operation: Any, is_comparison: bool, build: Any) -> None:
+    """Teach numba `operation` on two Lanes, or Lanes and a number."""
 
     @infer_global(operation)  # pyright: ignore[reportOptionalCall]
     class _Typing(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:
-            if lanes_type in args and all(a in (lanes_type, types.float32) for a in args):
-                return signature(result, *[lanes_type] * len(args))
+            for kind in _KINDS.values():
+                if kind in args and all(a in (kind, kind.element) for a in args):
+                    return signature(mask_type if is_comparison else kind, *[kind] * len(args))
             return None
 
-    @lower_builtin(operation, lanes_type, lanes_type)
-    def _(context, builder, sig, args):  # pyright: ignore[reportUnusedParameter]
-        return build(builder, *args)
+    for kind in _KINDS.values():
+
+        @lower_builtin(operation, kind, kind)
+        def _(context, builder, sig, args):  # pyright: ignore[reportUnusedParameter]
+            return build(builder, *args)
 
 
-_elementwise(operator.add, lanes_type, lambda builder, a, b: builder.fadd(a, b, flags=_FLAGS))
-_elementwise(operator.sub, lanes_type, lambda builder, a, b: builder.fsub(a, b, flags=_FLAGS))
-_elementwise(operator.mul, lanes_type, lambda builder, a, b: builder.fmul(a, b, flags=_FLAGS))
-_elementwise(operator.truediv, lanes_type, lambda builder, a, b: builder.fdiv(a, b, flags=_FLAGS))
-_elementwise(operator.gt, mask_type, lambda builder, a, b: builder.fcmp_ordered(">", a, b, flags=_FLAGS))
-_elementwise(operator.ge, mask_type, lambda builder, a, b: builder.fcmp_ordered(">=", a, b, flags=_FLAGS))
-_elementwise(operator.lt, mask_type, lambda builder, a, b: builder.fcmp_ordered("<", a, b, flags=_FLAGS))
+for _kind in _KINDS.values():
+
+    @lower_cast(_kind.element, _kind)
+    def _(context, builder, source, target, value):  # pyright: ignore[reportUnusedParameter]
+        return _broadcast(builder, value)
+
+
+_elementwise(operator.add, False, lambda builder, a, b: builder.fadd(a, b, flags=_FLAGS))
+_elementwise(operator.sub, False, lambda builder, a, b: builder.fsub(a, b, flags=_FLAGS))
+_elementwise(operator.mul, False, lambda builder, a, b: builder.fmul(a, b, flags=_FLAGS))
+_elementwise(operator.truediv, False, lambda builder, a, b: builder.fdiv(a, b, flags=_FLAGS))
+_elementwise(operator.gt, True, lambda builder, a, b: builder.fcmp_ordered(">", a, b, flags=_FLAGS))
+_elementwise(operator.ge, True, lambda builder, a, b: builder.fcmp_ordered(">=", a, b, flags=_FLAGS))
+_elementwise(operator.lt, True, lambda builder, a, b: builder.fcmp_ordered("<", a, b, flags=_FLAGS))
 
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
     data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
+    return builder.bitcast(builder.gep(data, [index]), _ir(_KINDS[kind.dtype]).as_pointer())
 
 
 @intrinsic
 def load(typingctx, array, index):
-    """The Lanes at array[index : index + LANES] of a contiguous float32 array [n]; bounds are not checked."""
+    """The Lanes at array[index : index + LANES] of a contiguous array [n]; bounds are not checked."""
 
     def build(context, builder, sig, args):
         return builder.load(_address(context, builder, sig.args[0], *args), align=4)
 
-    return lanes_type(array, types.intp), build
+    return _KINDS[array.dtype](array, types.intp), build
 
 
 @intrinsic
@@ -106,7 +120,7 @@ def store(typingctx, array, index, value):
         builder.store(args[2], _address(context, builder, sig.args[0], *args[:2]), align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, lanes_type), build
+    return types.void(array, types.intp, _KINDS[array.dtype]), build
 
 
 @intrinsic
@@ -128,8 +142,8 @@ def prefetch_to_write(typingctx, array, index):
 
 @intrinsic
 def lanes(typingctx, number):
-    """All lanes equal to a float32."""
-    return lanes_type(types.float32), lambda context, builder, sig, args: _broadcast(builder, args[0])
+    """All lanes equal to a number."""
+    return _KINDS[number](number), lambda context, builder, sig, args: _broadcast(builder, args[0])
 
 
 @intrinsic
@@ -139,7 +153,7 @@ def select(typingctx, mask, a, b):
     def build(context, builder, sig, args):
         return builder.select(*args)
 
-    return lanes_type(mask_type, lanes_type, lanes_type), build
+    return a(mask_type, a, a), build
 
 
 @intrinsic
@@ -149,7 +163,7 @@ def minimum(typingctx, a, b):
     def build(context, builder, sig, args):
         return builder.select(builder.fcmp_ordered("<", *args, flags=_FLAGS), *args)
 
-    return lanes_type(lanes_type, lanes_type), build
+    return a(a, a), build
 
 
 @intrinsic
@@ -159,7 +173,7 @@ def maximum(typingctx, a, b):
     def build(context, builder, sig, args):
         return builder.select(builder.fcmp_ordered(">", *args, flags=_FLAGS), *args)
 
-    return lanes_type(lanes_type, lanes_type), build
+    return a(a, a), build
 
 
 @intrinsic
@@ -167,12 +181,11 @@ def magnitude(typingctx, a):
     """Absolute value, lane by lane."""
 
     def build(context, builder, sig, args):
-        function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(_FLOATS, [_FLOATS]), f"llvm.fabs.v{LANES}f32"
-        )
+        vector, name = _ir(a), f"llvm.fabs.v{LANES}f{a.element.bitwidth}"
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector]), name)
         return builder.call(function, args)
 
-    return lanes_type(lanes_type), build
+    return a(a), build
 
 
 @intrinsic
@@ -192,7 +205,7 @@ TOTALS = 16
 
 @intrinsic
 def store_totals(typingctx, array, index, values):
-    """array[index + k] = sum of all lanes of values[k], for a tuple of TOTALS Lanes and a contiguous float32 array [n].
+    """array[index + k] = sum of all lanes of values[k]: a tuple of TOTALS Lanes, a contiguous array [n], float32.
 
     Lanes are added pairwise while sums of different values move together: a third of the work of one sum after another.
     """

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from freqgs_plugin.functional.numba_threads import njit
-from freqgs_plugin.rendering.numba_lanes import (
+from freqgs_plugin.functional.numba_lanes import (
     LANES,
     TOTALS,
     add_row,
@@ -18,6 +17,7 @@ from freqgs_plugin.rendering.numba_lanes import (
     store,
     store_totals,
 )
+from freqgs_plugin.functional.numba_threads import njit
 
 f4 = np.float32
 
@@ -58,32 +58,33 @@ def _totals(a, out, sums):
     add_row(sums, out, 3)
 
 
-@pytest.fixture
-def pair() -> tuple[np.ndarray, np.ndarray]:
+@pytest.fixture(params=[np.float32, np.float64])
+def pair(request: pytest.FixtureRequest) -> tuple[np.ndarray, np.ndarray]:
     generator = np.random.default_rng(0)
-    a, b = generator.normal(size=(2, 4 * LANES)).astype(f4)
+    a, b = generator.normal(size=(2, 4 * LANES)).astype(request.param)
     b[::5] = a[::5]
     return a, b
 
 
 def test_each_operation_is_numpys(pair: tuple[np.ndarray, np.ndarray]):
     a, b = pair
-    number = f4(0.25)
-    out = np.zeros((10, len(a)), f4)
+    number = a.dtype.type(0.25)
+    out = np.zeros((10, len(a)), a.dtype)
     _apply(a, b, number, out)
     expected = [
         a + b, a - number, number * b, a / b, np.minimum(a, b), np.maximum(a, b), np.abs(a),
         np.where(a > b, a, number), np.where(a >= b, a, number), np.where(a < number, a, b),
     ]  # fmt: skip
-    np.testing.assert_allclose(out, expected, rtol=1e-6)
+    np.testing.assert_allclose(out, expected, rtol=8 * np.finfo(a.dtype).eps)
 
 
 @pytest.mark.parametrize("position", [0, LANES - 1, 2 * LANES + 3])
-def test_any_set_sees_every_lane(position: int):
-    a = np.ones(4 * LANES, f4)
-    assert not _any_above(a, f4(1))
+@pytest.mark.parametrize("scalar", [np.float32, np.float64])
+def test_any_set_sees_every_lane(position: int, scalar: type):
+    a = np.ones(4 * LANES, scalar)
+    assert not _any_above(a, scalar(1))
     a[position] = 2
-    assert _any_above(a, f4(1))
+    assert _any_above(a, scalar(1))
 
 
 def test_totals_are_in_their_places_and_nowhere_else():
