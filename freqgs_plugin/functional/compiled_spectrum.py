@@ -9,24 +9,24 @@ from freqgs_plugin.functional.compiled_rows import row_sum
 from freqgs_plugin.functional.numba_threads import njit, prange
 
 
-def compiled_magnitude(image: Tensor) -> Tensor:
+def compiled_magnitude(image: Tensor, size: tuple[int, int]) -> Tensor:
     image = image.detach()
-    planes, (height, width) = image.shape[:-2].numel(), image.shape[-2:]
+    planes, (height, width) = image.shape[:-2].numel(), size
     out = image.new_empty(planes, height, width // 2 + 1)
-    _magnitudes(_paired_spectrum([image]).numpy(), out.numpy())
-    return out.view(*image.shape[:-1], width // 2 + 1)
+    _magnitudes(_paired_spectrum([image], size).numpy(), out.numpy())
+    return out.view(*image.shape[:-2], height, width // 2 + 1)
 
 
 class CompiledDistance(torch.autograd.Function):
-    """Mean of | |F(x)| - T | on CPU over images x of one size, T of all of them in order: a complex transform per pair
-    of planes, one compiled pass over the bins, and one inverse transform for the gradient.
+    """Mean of | |F(x)| - T | on CPU over images x of one size, T of all of them in order: a complex transform of `size`
+    per pair of planes, one compiled pass over the bins, and one inverse transform for the gradient.
     """
 
     @staticmethod
-    def forward(ctx, target, *images):
-        height, width = images[0].shape[-2:]
+    def forward(ctx, target, size, *images):
+        height, width = size
         target = target.detach().to(images[0].dtype).reshape(-1, height, width // 2 + 1).contiguous()
-        spectrum = _paired_spectrum([image.detach() for image in images])
+        spectrum = _paired_spectrum([image.detach() for image in images], size)
         sums = np.zeros(spectrum.shape[:2])
         _compare(spectrum.numpy(), target.numpy(), sums)
         ctx.save_for_backward(spectrum)
@@ -39,10 +39,10 @@ class CompiledDistance(torch.autograd.Function):
         pairs = torch.view_as_real(torch.fft.ifft2(torch.view_as_complex(ctx.saved_tensors[0]), norm="forward"))
         gradients = [upstream.new_empty(shape) for shape in ctx.shapes]
         planes = _planes(gradients)
-        scale = upstream / (len(planes) * planes[0].numel())
+        scale = upstream / (len(planes) * pairs[0, ..., 0].numel())
         for p, pair in enumerate(pairs):
             _unpack(pair.numpy(), scale.numpy(), planes[2 * p].numpy(), _partner(planes, p).numpy())
-        return None, *gradients
+        return None, None, *gradients
 
 
 def _planes(images: list[Tensor]) -> list[Tensor]:
@@ -55,10 +55,10 @@ def _partner(planes: list[Tensor], p: int) -> Tensor:
     return planes[min(2 * p + 1, len(planes) - 1)]
 
 
-def _paired_spectrum(images: list[Tensor]) -> Tensor:
-    """`[pairs h w 2]`: the full DFT of plane 2p + i * plane 2p + 1, as reals."""
+def _paired_spectrum(images: list[Tensor], size: tuple[int, int]) -> Tensor:
+    """`[pairs u v 2]`: the full DFT of plane 2p + i * plane 2p + 1, each with zeros up to `size`, as reals."""
     planes = _planes(images)
-    pairs = planes[0].new_empty((len(planes) + 1) // 2, *planes[0].shape, 2)
+    pairs = planes[0].new_empty((len(planes) + 1) // 2, *size, 2)
     for p, pair in enumerate(pairs):
         _pack(planes[2 * p].numpy(), _partner(planes, p).numpy(), pair.numpy())
     return torch.view_as_real(torch.fft.fft2(torch.view_as_complex(pairs)))
@@ -67,16 +67,21 @@ def _paired_spectrum(images: list[Tensor]) -> Tensor:
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)
 def _pack(first, second, pair):
     for u in prange(len(pair)):
-        a, b, out = first[u], second[u], pair[u]
-        for v in range(a.size):
-            out[v, 0], out[v, 1] = a[v], b[v]
+        out = pair[u]
+        if u < len(first):
+            a, b = first[u], second[u]
+            for v in range(a.size):
+                out[v, 0], out[v, 1] = a[v], b[v]
+            out[a.size :] = 0
+        else:
+            out[:] = 0
 
 
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)
 def _unpack(pair, scale, first, second):
     """The opposite of `_pack`, scaled; where both are one plane, its real parts stay."""
     factor = scale[()]
-    for u in prange(len(pair)):
+    for u in prange(len(first)):
         a, b, row = first[u], second[u], pair[u]
         for v in range(a.size):
             b[v] = row[v, 1] * factor

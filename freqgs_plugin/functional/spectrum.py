@@ -14,16 +14,43 @@ from torch import Tensor
 
 from freqgs_plugin.functional.pyramid import laplacian
 
+Size = tuple[int, int]
+_FAST_FACTORS = (2, 3, 5, 7, 11, 13)
 
-def magnitude(image: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w2"]:
-    """|F(u, v)| of the unnormalised DFT on the half plane w2 = w // 2 + 1; its gradient at magnitude 0 is 0."""
+
+def fast_size(height: int, width: int) -> Size:
+    """The least height and width from these on without prime factors above 13.
+
+    Transforms of other sizes take up to five times as long: 840x1297 px 54 ms, 840x1300 px 11 ms (three planes, one
+    thread, MKL).
+    """
+    return _fast_side(height), _fast_side(width)
+
+
+def _fast_side(side: int) -> int:
+    while True:
+        rest = side
+        for factor in _FAST_FACTORS:
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return side
+        side += 1
+
+
+def magnitude(image: Float[Tensor, "*batch h w"], size: Size | None = None) -> Float[Tensor, "*batch u v2"]:
+    """|F(u, v)| of the unnormalised DFT on the half plane v2 = v // 2 + 1; its gradient at magnitude 0 is 0.
+
+    `size` (u, v): of the transform, of an image with zeros to the right and below; None: the image's own.
+    """
+    size = _transform_size(image, size)
     image = _at_least_float32(image)
     if image.device.type == "cpu" and not (image.requires_grad and torch.is_grad_enabled()):
         from freqgs_plugin.functional.compiled_spectrum import compiled_magnitude
 
-        return compiled_magnitude(image)
+        return compiled_magnitude(image, size)
     with torch.autocast(image.device.type, enabled=False):
-        return _differentiable_magnitude(image)
+        return _differentiable_magnitude(image, size)
 
 
 def magnitude_distance(
@@ -40,17 +67,19 @@ def magnitude_distance(
 
 def magnitude_distance_to(
     pred: Float[Tensor, "*batch h w"] | Sequence[Float[Tensor, "_ *rest h w"]],
-    target_magnitude: Float[Tensor, "*batch h w2"],
+    target_magnitude: Float[Tensor, "*batch u v2"],
     norm: Literal["backward", "ortho"] = "backward",
+    size: Size | None = None,
 ) -> Float[Tensor, ""]:
-    """`magnitude_distance` to an image of which only `magnitude(target)` is kept, unnormalised whatever `norm` is.
+    """`magnitude_distance` to an image of which only `magnitude(target, size)` is kept, unnormalised in any case.
 
-    Several `pred` count as one, concatenated along the first axis; on CPU that copies nothing.
+    Several `pred` count as one, concatenated along the first axis; on CPU that copies nothing. With a `size` of the
+    transform that is not the image's, the mean is over its u and v.
     """
     preds = [pred] if isinstance(pred, Tensor) else list(pred)
     shape = preds[0].shape if len(preds) == 1 else (sum(map(len, preds)), *preds[0].shape[1:])
-    height, width = shape[-2:]
-    expected = (*shape[:-1], width // 2 + 1)
+    size = height, width = _transform_size(preds[0], size)
+    expected = (*shape[:-2], height, width // 2 + 1)
     if tuple(target_magnitude.shape) != expected:
         got = tuple(target_magnitude.shape)
         raise ValueError(f"magnitudes of {tuple(shape)} images have shape {expected}, got {got}.")
@@ -58,12 +87,13 @@ def magnitude_distance_to(
     if preds[0].device.type == "cpu" and not target_magnitude.requires_grad:
         from freqgs_plugin.functional.compiled_spectrum import CompiledDistance
 
-        distance = CompiledDistance.apply(target_magnitude, *preds)
+        distance = CompiledDistance.apply(target_magnitude, size, *preds)
     else:
         pred = torch.cat(preds) if len(preds) > 1 else preds[0]
         with torch.autocast(pred.device.type, enabled=False):
-            difference = (_differentiable_magnitude(pred) - target_magnitude).abs().flatten(0, -2).sum(0)
-            distance = (difference * _occurrences(width, difference)).sum() / pred.numel()
+            difference = (_differentiable_magnitude(pred, size) - target_magnitude).abs().flatten(0, -2)
+            count = len(difference) * width
+            distance = (difference.sum(0) * _occurrences(width, difference)).sum() / count
     return distance / (height * width) ** 0.5 if norm == "ortho" else distance
 
 
@@ -100,8 +130,15 @@ def _at_least_float32(image: Tensor) -> Tensor:
     return image.float() if image.dtype in (torch.float16, torch.bfloat16) else image
 
 
-def _differentiable_magnitude(image: Tensor) -> Tensor:
-    return torch.fft.rfft2(image).abs()
+def _transform_size(image: Tensor, size: Size | None) -> Size:
+    height, width = image.shape[-2:]
+    if size is not None and (size[0] < height or size[1] < width):
+        raise ValueError(f"a transform of size {size} would cut a {height}x{width} image. Take at least its size.")
+    return (height, width) if size is None else size
+
+
+def _differentiable_magnitude(image: Tensor, size: Size) -> Tensor:
+    return torch.fft.rfft2(image, s=size).abs()
 
 
 def _occurrences(width: int, like: Tensor) -> Tensor:

@@ -22,8 +22,8 @@ _CHUNK = 256
 """Gaussians that one thread takes at a time"""
 
 # what a Gaussian's gradient is made of, as sums over pixels (of one tile): three columns for its features, then moments
-# of g = alpha dL/dalpha about its centre, first moments of the judged part of g, and of its absolutes
-MASS, M_X, M_Y, M_XX, M_XY, M_YY, STAT_X, STAT_Y, ABS_X, ABS_Y = range(3, 13)
+# of g = alpha dL/dalpha in u = U dx + S dy and dy, first moments of the judged part of g, and of its absolutes
+MASS, M_U, M_Y, M_UU, M_UY, M_YY, STAT_U, STAT_Y, ABS_X, ABS_Y = range(3, 13)
 V_COLUMNS = TOTALS
 
 
@@ -149,19 +149,19 @@ def _carry_back_one(
     low_u, high_u, low_v, high_v = _limits(fx, fy, cx, cy, width, height)
     R = view[:3, :3]
     want_view = v_view.shape[0] > 0
-    # conic of exp(-(U dx + S dy)^2 - V dy^2) = exp(-(A dx^2 + 2 B dx dy + C dy^2) / 2)
     su, ss, sv = np.float64(splats[i, U]), np.float64(splats[i, S]), np.float64(splats[i, V])
-    conic_a, conic_b, conic_c = 2.0 * su * su, 2.0 * su * ss, 2.0 * (sv + ss * ss)
     v_features[i, 0], v_features[i, 1], v_features[i, 2] = sums[0], sums[1], sums[2]
-    v_means2d[i, 0] = conic_a * sums[STAT_X] + conic_b * sums[STAT_Y]
-    v_means2d[i, 1] = conic_b * sums[STAT_X] + conic_c * sums[STAT_Y]
+    v_means2d[i, 0] = 2.0 * su * sums[STAT_U]
+    v_means2d[i, 1] = 2.0 * (ss * sums[STAT_U] + sv * sums[STAT_Y])
     v_abs[i, 0], v_abs[i, 1] = su * sums[ABS_X], sums[ABS_Y]
     if not moves:
         return
     v_alpha = sums[MASS] / splats[i, OPACITY]
-    v_x = conic_a * sums[M_X] + conic_b * sums[M_Y]
-    v_y = conic_b * sums[M_X] + conic_c * sums[M_Y]
-    v_a, v_b, v_c = -0.5 * sums[M_XX], -sums[M_XY], -0.5 * sums[M_YY]
+    v_x, v_y = 2.0 * su * sums[M_U], 2.0 * (ss * sums[M_U] + sv * sums[M_Y])
+    # of the conic in exp(-(A dx^2 + 2 B dx dy + C dy^2) / 2), with dx = (u - S dy) / U
+    m_xy = (sums[M_UY] - ss * sums[M_YY]) / su
+    m_xx = (sums[M_UU] - 2.0 * ss * sums[M_UY] + ss * ss * sums[M_YY]) / (su * su)
+    v_a, v_b, v_c = -0.5 * m_xx, -m_xy, -0.5 * sums[M_YY]
 
     m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     z = R[2, 0] * m0 + R[2, 1] * m1 + R[2, 2] * m2 + view[2, 3]

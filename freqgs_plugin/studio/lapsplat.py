@@ -46,6 +46,9 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """weight of the image term (Eq. 13, the paper)"""
     dft_weight: float = 1e-3
     """weight of the frequency term (Eq. 13, the paper); 0 leaves it out"""
+    dft_size: Literal["image", "fast"] = "fast"
+    """size of the transforms: the image's (the paper), or with zeros up to the next one without prime factors above 13
+    (ours), which takes down to a fifth of the time"""
     dft_norm: Literal["backward", "ortho"] = "backward"
     """scaling of the DFT: none (the paper; the term then grows with image size) or 1 / sqrt(pixels)"""
     lower_level_weight: float = 0.2
@@ -182,8 +185,8 @@ class LapSplatModel(FreqSplatModel):
             statistics="own" if self.config.growth == "own_prefix" else "full",
         )
 
-    def _needs_magnitudes(self) -> bool:
-        return self.config.dft_weight != 0
+    def _target_options(self) -> dict[str, Any]:
+        return {"dft": self.config.dft_weight != 0, "dft_size": self.config.dft_size}
 
     def _objective(self, outputs: dict[str, Any], target: ViewTarget) -> dict[str, Tensor]:
         config = self.config

@@ -15,7 +15,7 @@ from freqgs_plugin.functional.image_loss import image_distance
 from freqgs_plugin.rendering.render import rendered_weight
 from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.config import FreqSplatModelConfig
-from freqgs_plugin.studio.optimizers import adopt_parameters, scale_schedulers
+from freqgs_plugin.studio.optimizers import adopt_parameters, fuse, scale_schedulers
 from freqgs_plugin.studio.targets import TargetCache, ViewTarget
 from freqgs_plugin.studio.viewing import SplatViews, psnr, show
 from freqgs_plugin.training.densify import LevelStrategy
@@ -73,9 +73,9 @@ class FreqSplatModel(SplatViews):
         """What each Gaussian's 2D gradient is divided by before it is compared with the densification threshold."""
         return None
 
-    def _needs_magnitudes(self) -> bool:
-        """Whether the objective compares DFT magnitudes."""
-        return False
+    def _target_options(self) -> dict[str, Any]:
+        """Of `PyramidTargets.from_image`: what the objective compares with."""
+        return {"dft": False}
 
     def _adapt_to_images(self, height: int, width: int) -> None:
         """Before a new run: the smallest training image has this size, px."""
@@ -154,6 +154,7 @@ class FreqSplatModel(SplatViews):
         self.strategy.refine_scale2d_stop_iter = self.schedule.screen_size_stop
         CONSOLE.log(f"Step constants are multiplied by {self._scale:g}.")
         adopt_parameters(optimizers, self.get_param_groups())
+        fuse(optimizers, self.get_param_groups())
         scale_schedulers(optimizers, self._scale)
         for name in self.gauss_params:
             optimizers.optimizers[name].register_step_pre_hook(lambda *_: self._check_gradients(trainer))
@@ -283,7 +284,7 @@ class FreqSplatModel(SplatViews):
             return self.composite_with_background(self._halve(image), background), mask
 
         key = (int(batch["image_idx"]), levels, self._halvings()) if opaque and "image_idx" in batch else None
-        return self._targets.get(key, make, levels, dft=self._needs_magnitudes())
+        return self._targets.get(key, make, levels, **self._target_options())
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         if self.training:

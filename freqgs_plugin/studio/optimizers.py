@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch
 from nerfstudio.engine.optimizers import Optimizers
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -23,6 +24,15 @@ def adopt_parameters(optimizers: Optimizers, groups: dict[str, list[Any]]) -> No
                     key: value.to(parameter.device) if hasattr(value, "to") and value.dim() else value
                     for key, value in state.items()
                 }
+
+
+def fuse(optimizers: Optimizers, groups: dict[str, list[Any]]) -> None:
+    """Have Adam move parameters on the CPU in one pass over memory: half the time of its one pass per operation."""
+    for name, params in groups.items():
+        optimizer = optimizers.optimizers[name]
+        if isinstance(optimizer, torch.optim.Adam) and all(p.device.type == "cpu" for p in params):
+            for group in optimizer.param_groups:
+                group["fused"] = True
 
 
 def scale_schedulers(optimizers: Optimizers, scale: float) -> None:

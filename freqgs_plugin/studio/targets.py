@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
@@ -37,13 +38,16 @@ class TargetCache:
         self._used = 0.0
 
     def get(
-        self, key: Hashable | None, make: Callable[[], tuple[Tensor, Tensor | None]], levels: int, dft: bool
+        self, key: Hashable | None, make: Callable[[], tuple[Tensor, Tensor | None]], levels: int, **options: Any
     ) -> ViewTarget:
-        """The target under `key`, or made by `make` (image [h, w, 3], mask [h, w, 1]); `key` None: not kept."""
+        """The target under `key`, or made by `make` (image [h, w, 3], mask [h, w, 1]); `key` None: not kept.
+
+        `options` are those of `PyramidTargets.from_image`.
+        """
         if key is not None and key in self._kept:
             return self._kept[key]
         image, mask = make()
-        pyramid = PyramidTargets.from_image(image, levels, mask, dft=dft)
+        pyramid = PyramidTargets.from_image(image, levels, mask, **options)
         if mask is None:
             image = pyramid.reduced[-1][0].permute(1, 2, 0)
         target = ViewTarget(image, mask, pyramid)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from freqgs_plugin.functional.image_loss import Clamp, image_distance, prepare
 from freqgs_plugin.functional.pyramid import low_pass, reduce
-from freqgs_plugin.functional.spectrum import magnitude, magnitude_distance_to
+from freqgs_plugin.functional.spectrum import Size, fast_size, magnitude, magnitude_distance_to
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,8 @@ class PyramidTargets:
     """REDUCE^(m-k) of the masked image for levels k = 1..m, coarse to fine"""
     magnitudes: Float[Tensor, "levels 3 h w2"] | None
     """DFT magnitudes of the low-passed image for levels k = 1..m-1; None without the frequency term or if m = 1"""
+    dft_size: Size | None = None
+    """size of these transforms; None: the image's"""
 
     @classmethod
     def from_image(
@@ -39,14 +41,19 @@ class PyramidTargets:
         mask: Float[Tensor, "h w 1"] | None = None,
         *,
         dft: bool = True,
+        dft_size: Literal["image", "fast"] = "image",
     ) -> "PyramidTargets":
-        """The targets for m levels; `dft=False` leaves the magnitudes (of about the image's size per level) out."""
+        """The targets for m levels; `dft=False` leaves the magnitudes (of about the image's size per level) out.
+
+        `dft_size`: the transforms' size is the image's (Eq. 7) or the next `fast_size`, with zeros beyond the image.
+        """
         full = _planes(image, mask)
         reduced = [full]
         for _ in range(m - 1):
             reduced.append(reduce(reduced[-1]))
         low = [low_pass(full, m - k) for k in range(1, m)] if dft else []
-        return cls(tuple(reversed(reduced)), magnitude(torch.cat(low)) if low else None)
+        size = fast_size(*full.shape[-2:]) if dft_size == "fast" else None
+        return cls(tuple(reversed(reduced)), magnitude(torch.cat(low), size) if low else None, size)
 
 
 def default_level_weights(m: int) -> list[float]:
@@ -96,7 +103,7 @@ def pyramid_objective(
         if targets.magnitudes is None:
             raise ValueError("targets lack DFT magnitudes. Make them with `dft=True`, or call with `dft=False`.")
         # the mean over the stacked levels, times their number, is the sum of Eq. 8
-        distance = magnitude_distance_to(renders[:-1], targets.magnitudes, dft_norm)
+        distance = magnitude_distance_to(renders[:-1], targets.magnitudes, dft_norm, targets.dft_size)
         terms["dft"] = dft_weight * (m - 1) * distance
     return terms
 

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from freqgs_plugin.functional.spectrum import (
     band_energy,
+    fast_size,
     magnitude,
     magnitude_distance,
     magnitude_distance_to,
@@ -121,6 +122,31 @@ def test_several_images_count_as_their_concatenation(counts, channels):
         assert torch.equal(one, other)
     plain = magnitude_distance_to(images, target.requires_grad_())
     assert plain.item() == pytest.approx(apart.item(), rel=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 7, 9), (3, 1, 5, 8), (2, 3, 1, 1)])
+@pytest.mark.parametrize("size", [(7, 9), (9, 10), (8, 15)])
+def test_a_larger_transform_sees_zeros_beyond_the_image(shape, size):
+    a, b = noise(*shape).requires_grad_(), noise(*shape, seed=1)
+    padding = (0, size[1] - shape[-1], 0, size[0] - shape[-2])
+    larger_a, larger_b = torch.nn.functional.pad(a, padding), torch.nn.functional.pad(b, padding)
+    torch.testing.assert_close(magnitude(b, size), magnitude(larger_b), rtol=0, atol=1e-12)
+    distance, expected = magnitude_distance_to(a, magnitude(b, size), size=size), magnitude_distance(larger_a, larger_b)
+    plain = magnitude_distance_to(a, magnitude(b, size).requires_grad_(), size=size)
+    assert distance.item() == pytest.approx(expected.item(), rel=1e-12) == plain.item()
+    gradients = [torch.autograd.grad(value, a)[0] for value in (distance, expected, plain)]
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=0, atol=1e-12)
+    torch.testing.assert_close(gradients[0], gradients[2], rtol=0, atol=1e-12)
+
+
+def test_fast_sizes_have_small_prime_factors():
+    assert fast_size(319, 480) == (320, 480) and fast_size(840, 1297) == (840, 1300) == fast_size(840, 1300)
+    assert fast_size(1, 127) == (1, 128)
+
+
+def test_a_transform_smaller_than_the_image_is_refused():
+    with pytest.raises(ValueError, match=r"size \(8, 7\) would cut a 8x8 image"):
+        magnitude(noise(1, 3, 8, 8), (8, 7))
 
 
 def test_wrong_target_shape_is_named():

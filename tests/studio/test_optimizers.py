@@ -5,7 +5,7 @@ import pytest
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 
-from freqgs_plugin.studio.optimizers import adopt_parameters, restart, scale_schedulers, set_rate
+from freqgs_plugin.studio.optimizers import adopt_parameters, fuse, restart, scale_schedulers, set_rate
 from method_configs.optimizers import splat_optimizers
 
 
@@ -46,6 +46,18 @@ def test_new_parameters_keep_the_optimizer_state(optimizers, groups):
     before = new["means"][0].detach().clone()
     step(optimizers)
     assert not torch.equal(new["means"][0], before)
+
+
+def test_fused_steps_are_the_same_steps(optimizers, groups):
+    other_groups = {n: [torch.nn.Parameter(p[0].detach().clone())] for n, p in groups.items()}
+    table = splat_optimizers()
+    fused = Optimizers({name: table[name] for name in groups}, other_groups)
+    fuse(fused, other_groups)
+    assert all(o.param_groups[0]["fused"] for o in fused.optimizers.values())
+    step(optimizers, 5)
+    step(fused, 5)
+    for name in groups:
+        torch.testing.assert_close(other_groups[name][0], groups[name][0], rtol=1e-6, atol=1e-7)
 
 
 def test_parameters_without_state_are_adopted_too(optimizers, groups):

@@ -6,6 +6,7 @@ import pytest
 import torch
 from pytorch_msssim import ssim as reference_ssim
 
+from freqgs_plugin.functional.pyramid import low_pass
 from freqgs_plugin.training import objective
 from freqgs_plugin.training.objective import PyramidTargets, default_level_weights, pyramid_objective
 
@@ -121,6 +122,19 @@ def test_weights_scale_their_terms():
         assert weighted[name].item() == pytest.approx(factor * plain[name].item(), rel=1e-12)
     ortho = pyramid_objective(prefixes, image, dft_norm="ortho")["dft"]
     assert ortho.item() == pytest.approx(plain["dft"].item() / np.sqrt(64 * 48), rel=1e-12)
+
+
+def test_transforms_of_a_fast_size_are_those_of_images_with_zeros_around():
+    prefixes, image = scene(3, (17, 19))
+    targets = PyramidTargets.from_image(image, 3, dft_size="fast")
+    assert targets.dft_size == (18, 20) and targets.magnitudes is not None
+    low = [low_pass(image.permute(2, 0, 1)[None], n)[0] for n in (2, 1)]
+    expected = sum(
+        np.abs(np.abs(np.fft.fft2(a, (18, 20))) - np.abs(np.fft.fft2(b, (18, 20)))).mean()
+        for a, b in zip(low, (p.detach().permute(2, 0, 1) for p in prefixes), strict=False)
+    )
+    dft = pyramid_objective(prefixes, image, targets=targets, dft_weight=0.5)["dft"]
+    assert dft.item() == pytest.approx(0.5 * expected, rel=1e-10)
 
 
 def test_the_finest_prefix_has_no_frequency_term():
