@@ -6,7 +6,7 @@ from numba import get_num_threads
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from freqgs_plugin.functional.compiled_rows import row_sum
+from freqgs_plugin.functional.compiled_rows import row_sum, scaled
 from freqgs_plugin.functional.image_loss import C1, C2, TAPS
 from freqgs_plugin.functional.numba_lanes import LANES, lanes, load, maximum, store
 from freqgs_plugin.functional.numba_threads import njit, prange
@@ -38,7 +38,7 @@ class CompiledImageSums(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream):
-        return ctx.saved_tensors[0] * upstream, None, None, None, None, None, None
+        return scaled(ctx.saved_tensors[0], upstream), None, None, None, None, None, None
 
 
 def image_sums(

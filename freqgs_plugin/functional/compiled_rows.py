@@ -1,4 +1,6 @@
-"""What compiled kernels of several modules do with a row."""
+"""What several compiled losses share."""
+
+from torch import Tensor
 
 from freqgs_plugin.functional.numba_threads import njit
 
@@ -10,3 +12,8 @@ def row_sum(line):
     for i in range(line.size):
         total += line[i]
     return total
+
+
+def scaled(gradient: Tensor, upstream: Tensor) -> Tensor:
+    """`gradient` times a number; not copied where that is 1."""
+    return gradient if float(upstream) == 1 else gradient * upstream

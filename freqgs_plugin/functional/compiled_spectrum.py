@@ -1,48 +1,57 @@
 """DFT magnitudes and their distance on the CPU, compiled: `spectrum` is the interface."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from freqgs_plugin.functional.compiled_rows import row_sum
+from freqgs_plugin.functional.compiled_rows import row_sum, scaled
 from freqgs_plugin.functional.numba_threads import njit, prange
 
 
 def compiled_magnitude(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """|F| [..., u, v // 2 + 1]."""
     image = image.detach()
-    planes, (height, width) = image.shape[:-2].numel(), size
-    out = image.new_empty(planes, height, width // 2 + 1)
-    _magnitudes(_paired_spectrum([image], size).numpy(), out.numpy())
-    return out.view(*image.shape[:-2], height, width // 2 + 1)
+    planes = _planes([image])
+    out = image.new_empty(len(planes), size[0], size[1] // 2 + 1)
+    for p, spectrum in enumerate(_paired_spectra(planes, size)):
+        _magnitudes(spectrum.numpy(), out[2 * p : 2 * p + 2].numpy())
+    return out.view(*image.shape[:-2], *out.shape[1:])
 
 
 class CompiledDistance(torch.autograd.Function):
-    """Mean of | |F(x)| - T | on CPU over images x of one size, T of all of them in order: a complex transform of `size`
-    per pair of planes, one compiled pass over the bins, and one inverse transform for the gradient.
+    """`weight` times the mean of | |F(x)| - T | on CPU over images x of one size, T of all of them in order.
+
+    Two planes at a time, so that they stay in the second-level cache: one complex transform of `size`, one compiled
+    pass over its bins and, where a gradient is wanted, the transform back.
     """
 
     @staticmethod
-    def forward(ctx, target, size, *images):
+    def forward(ctx, target, size, weight, *images):
         height, width = size
         target = target.detach().to(images[0].dtype).reshape(-1, height, width // 2 + 1).contiguous()
-        spectrum = _paired_spectrum([image.detach() for image in images], size)
-        sums = np.zeros(spectrum.shape[:2])
-        _compare(spectrum.numpy(), target.numpy(), sums)
-        ctx.save_for_backward(spectrum)
-        ctx.shapes = [image.shape for image in images]
-        return images[0].new_tensor(sums.sum() / (len(target) * height * width))
+        planes = _planes([image.detach() for image in images])
+        wanted = any(ctx.needs_input_grad[3:])
+        gradients = [image.new_empty(image.shape if wanted else 0) for image in images]
+        parts = _planes(gradients) if wanted else []
+        scale, total = weight / (len(planes) * height * width), 0.0
+        for p, spectrum in enumerate(_paired_spectra(planes, size)):
+            sums = np.zeros(height)
+            _compare(spectrum.numpy(), target[2 * p : 2 * p + 2].numpy(), sums)
+            total += sums.sum()
+            if wanted:
+                pair = torch.view_as_real(torch.fft.ifft2(torch.view_as_complex(spectrum), norm="forward"))
+                factor = pair.numpy().dtype.type(scale)
+                _unpack(pair.numpy(), factor, parts[2 * p].numpy(), _partner(parts, p).numpy())
+        ctx.save_for_backward(*gradients)
+        return images[0].new_tensor(total * scale)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream):
-        pairs = torch.view_as_real(torch.fft.ifft2(torch.view_as_complex(ctx.saved_tensors[0]), norm="forward"))
-        gradients = [upstream.new_empty(shape) for shape in ctx.shapes]
-        planes = _planes(gradients)
-        scale = upstream / (len(planes) * pairs[0, ..., 0].numel())
-        for p, pair in enumerate(pairs):
-            _unpack(pair.numpy(), scale.numpy(), planes[2 * p].numpy(), _partner(planes, p).numpy())
-        return None, None, *gradients
+        return None, None, None, *(scaled(gradient, upstream) for gradient in ctx.saved_tensors)
 
 
 def _planes(images: list[Tensor]) -> list[Tensor]:
@@ -55,13 +64,12 @@ def _partner(planes: list[Tensor], p: int) -> Tensor:
     return planes[min(2 * p + 1, len(planes) - 1)]
 
 
-def _paired_spectrum(images: list[Tensor], size: tuple[int, int]) -> Tensor:
-    """`[pairs u v 2]`: the full DFT of plane 2p + i * plane 2p + 1, each with zeros up to `size`, as reals."""
-    planes = _planes(images)
-    pairs = planes[0].new_empty((len(planes) + 1) // 2, *size, 2)
-    for p, pair in enumerate(pairs):
+def _paired_spectra(planes: list[Tensor], size: tuple[int, int]) -> Iterator[Tensor]:
+    """`[u v 2]` for each pair: the full DFT of plane 2p + i * plane 2p + 1, each with zeros up to `size`, as reals."""
+    pair = planes[0].new_empty(*size, 2)
+    for p in range((len(planes) + 1) // 2):
         _pack(planes[2 * p].numpy(), _partner(planes, p).numpy(), pair.numpy())
-    return torch.view_as_real(torch.fft.fft2(torch.view_as_complex(pairs)))
+        yield torch.view_as_real(torch.fft.fft2(torch.view_as_complex(pair)))
 
 
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)
@@ -78,9 +86,8 @@ def _pack(first, second, pair):
 
 
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)
-def _unpack(pair, scale, first, second):
-    """The opposite of `_pack`, scaled; where both are one plane, its real parts stay."""
-    factor = scale[()]
+def _unpack(pair, factor, first, second):
+    """The opposite of `_pack`, times `factor`; where both are one plane, its real parts stay."""
     for u in prange(len(first)):
         a, b, row = first[u], second[u], pair[u]
         for v in range(a.size):
@@ -90,13 +97,13 @@ def _unpack(pair, scale, first, second):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def _separate(spectrum, p, u, parts):
+def _separate(spectrum, u, parts):
     """Half a row of the spectra of both planes, from that of plane + i * plane at k and at -k.
 
     `parts` [4, w2]: real and imaginary part of the first plane's, then of the second's.
     """
-    height, width = spectrum.shape[1:3]
-    here, mirrored = spectrum[p, u], spectrum[p, (height - u) % height]
+    height, width = spectrum.shape[:2]
+    here, mirrored = spectrum[u], spectrum[(height - u) % height]
     half = spectrum.dtype.type(0.5)
     for v in range(width // 2 + 1):
         w = width - v if v > 0 else 0
@@ -127,14 +134,13 @@ def _polar(real, imaginary, size):
 
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)
 def _magnitudes(spectrum, out):
-    pairs, height, width = spectrum.shape[:3]
-    for task in prange(pairs * height):
-        p, u = task // height, task % height
+    """`out` [1 or 2, h, w2] from the spectrum of one or two planes."""
+    height, width = spectrum.shape[:2]
+    for u in prange(height):
         parts = np.empty((4, width // 2 + 1), spectrum.dtype)
-        _separate(spectrum, p, u, parts)
-        _polar(parts[0], parts[1], out[2 * p, u])
-        if 2 * p + 1 < len(out):
-            _polar(parts[2], parts[3], out[2 * p + 1, u])
+        _separate(spectrum, u, parts)
+        for plane in range(len(out)):
+            _polar(parts[2 * plane], parts[2 * plane + 1], out[plane, u])
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -154,10 +160,10 @@ def _difference(real, imaginary, size, target, width):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def _combine(parts, spectrum, p, u):
+def _combine(parts, spectrum, u):
     """The opposite of `_separate`."""
-    height, width = spectrum.shape[1:3]
-    here, mirrored = spectrum[p, u], spectrum[p, (height - u) % height]
+    height, width = spectrum.shape[:2]
+    here, mirrored = spectrum[u], spectrum[(height - u) % height]
     for v in range(width // 2 + 1):
         here[v, 0], here[v, 1] = parts[0, v] - parts[3, v], parts[1, v] + parts[2, v]
     for v in range(1, (width + 1) // 2):
@@ -167,24 +173,22 @@ def _combine(parts, spectrum, p, u):
 
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)
 def _compare(spectrum, target, sums):
-    """Sums of | |F| - T | per row of the full plane; the spectrum becomes that of the derivatives.
+    """Sums of | |F| - T | per row of the full plane, `target` [1 or 2, h, w2]; the spectrum becomes the derivatives'.
 
     A row and its mirror image are made of each other, so one task changes both.
     """
-    pairs, height, width = spectrum.shape[:3]
-    rows = height // 2 + 1
-    for task in prange(pairs * rows):
-        p, u = task // rows, task % rows
+    height, width = spectrum.shape[:2]
+    for task in prange(height // 2 + 1):
+        u = np.int64(task)
         both = (u, (height - u) % height)
         count = 1 if both[0] == both[1] else 2
-        parts, size = np.empty((2, 4, width // 2 + 1), spectrum.dtype), np.empty(width // 2 + 1, spectrum.dtype)
+        parts, size = np.zeros((2, 4, width // 2 + 1), spectrum.dtype), np.empty(width // 2 + 1, spectrum.dtype)
         for i in range(count):
-            _separate(spectrum, p, both[i], parts[i])
+            _separate(spectrum, both[i], parts[i])
         for i in range(count):
-            total = _difference(parts[i, 0], parts[i, 1], size, target[2 * p, both[i]], width)
-            if 2 * p + 1 < len(target):
-                total += _difference(parts[i, 2], parts[i, 3], size, target[2 * p + 1, both[i]], width)
-            else:
+            for plane in range(len(target)):
+                real, imaginary = parts[i, 2 * plane], parts[i, 2 * plane + 1]
+                sums[both[i]] += _difference(real, imaginary, size, target[plane, both[i]], width)
+            if len(target) == 1:
                 parts[i, 2:] = 0
-            sums[p, both[i]] = total
-            _combine(parts[i], spectrum, p, both[i])
+            _combine(parts[i], spectrum, both[i])

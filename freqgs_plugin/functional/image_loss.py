@@ -39,19 +39,24 @@ def prepare(pred: Float[Tensor, "*shape"], mode: Clamp) -> Float[Tensor, "*shape
 
 
 def image_distance(
-    pred: Float[Tensor, "b c h w"], target: Float[Tensor, "b c h w"], ssim_weight: float = 0.2
+    pred: Float[Tensor, "b c h w"],
+    target: Float[Tensor, "b c h w"],
+    ssim_weight: float | int = 0.2,
+    weight: float | int = 1.0,
 ) -> Float[Tensor, ""]:
-    """Eq. 11: (1 - ssim_weight) * mean |pred - target| + ssim_weight * (1 - SSIM); a part of weight 0 is not computed.
+    """Eq. 11: (1 - ssim_weight) * mean |pred - target| + ssim_weight * (1 - SSIM), times `weight`.
 
-    Masked pixels: multiply both images by the mask first.
+    A part of weight 0 is not computed. On CPU a factor on the result would cost a pass over the gradient, `weight` does
+    not. Masked pixels: multiply both images by the mask first.
     """
     if ssim_weight == 0:
-        return _mean_distance(pred, target)
+        return weight * _mean_distance(pred, target)
     pred, target = _comparable(pred, target)
     if not _has_kernels(pred, target):
-        return (1 - ssim_weight) * _mean_distance(pred, target) + ssim_weight * (1 - _ssim_by_convolution(pred, target))
-    by_l1 = (1 - ssim_weight) / pred.numel()
-    return ssim_weight + _compiled_sums(pred, target, -ssim_weight / _windows(pred), by_l1)
+        similarity = _ssim_by_convolution(pred, target)
+        return weight * ((1 - ssim_weight) * _mean_distance(pred, target) + ssim_weight * (1 - similarity))
+    by_l1, by_ssim = weight * (1 - ssim_weight) / pred.numel(), -weight * ssim_weight / _windows(pred)
+    return weight * ssim_weight + _compiled_sums(pred, target, by_ssim, by_l1)
 
 
 def ssim(pred: Float[Tensor, "b c h w"], target: Float[Tensor, "b c h w"]) -> Float[Tensor, ""]:

@@ -70,8 +70,9 @@ def magnitude_distance_to(
     target_magnitude: Float[Tensor, "*batch u v2"],
     norm: Literal["backward", "ortho"] = "backward",
     size: Size | None = None,
+    weight: float | int = 1.0,
 ) -> Float[Tensor, ""]:
-    """`magnitude_distance` to an image of which only `magnitude(target, size)` is kept, unnormalised in any case.
+    """`weight` times `magnitude_distance` to an image of which only `magnitude(target, size)` is kept.
 
     Several `pred` count as one, concatenated along the first axis; on CPU that copies nothing. With a `size` of the
     transform that is not the image's, the mean is over its u and v.
@@ -84,17 +85,17 @@ def magnitude_distance_to(
         got = tuple(target_magnitude.shape)
         raise ValueError(f"magnitudes of {tuple(shape)} images have shape {expected}, got {got}.")
     preds = [_at_least_float32(image) for image in preds]
+    if norm == "ortho":
+        weight = weight / (height * width) ** 0.5
     if preds[0].device.type == "cpu" and not target_magnitude.requires_grad:
         from freqgs_plugin.functional.compiled_spectrum import CompiledDistance
 
-        distance = CompiledDistance.apply(target_magnitude, size, *preds)
-    else:
-        pred = torch.cat(preds) if len(preds) > 1 else preds[0]
-        with torch.autocast(pred.device.type, enabled=False):
-            difference = (_differentiable_magnitude(pred, size) - target_magnitude).abs().flatten(0, -2)
-            count = len(difference) * width
-            distance = (difference.sum(0) * _occurrences(width, difference)).sum() / count
-    return distance / (height * width) ** 0.5 if norm == "ortho" else distance
+        return CompiledDistance.apply(target_magnitude, size, weight, *preds)  # pyright: ignore[reportReturnType]
+    pred = torch.cat(preds) if len(preds) > 1 else preds[0]
+    with torch.autocast(pred.device.type, enabled=False):
+        difference = (_differentiable_magnitude(pred, size) - target_magnitude).abs().flatten(0, -2)
+        count = len(difference) * width
+        return weight * (difference.sum(0) * _occurrences(width, difference)).sum() / count
 
 
 def radial_bands(height: int, width: int, levels: int, device: torch.device | str = "cpu") -> Int[Tensor, "h w2"]:

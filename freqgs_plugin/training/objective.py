@@ -97,14 +97,14 @@ def pyramid_objective(
     for k in range(1, m + 1):
         weight = image_weight * weights[k - 1] if k == m or lower_image_terms else 0.0
         if weight != 0:
-            distance = image_distance(reduce(renders[k - 1], m - k), targets.reduced[k - 1], ssim_weight)
-            terms[f"image_{k}"] = weight * distance
+            reduced = reduce(renders[k - 1], m - k)
+            terms[f"image_{k}"] = image_distance(reduced, targets.reduced[k - 1], ssim_weight, weight)
     if use_dft:
         if targets.magnitudes is None:
             raise ValueError("targets lack DFT magnitudes. Make them with `dft=True`, or call with `dft=False`.")
         # the mean over the stacked levels, times their number, is the sum of Eq. 8
-        distance = magnitude_distance_to(renders[:-1], targets.magnitudes, dft_norm, targets.dft_size)
-        terms["dft"] = dft_weight * (m - 1) * distance
+        weight = dft_weight * (m - 1)
+        terms["dft"] = magnitude_distance_to(renders[:-1], targets.magnitudes, dft_norm, targets.dft_size, weight)
     return terms
 
 
