@@ -134,6 +134,17 @@ def test_values_are_the_same_without_a_gradient(weight):
     assert torch.equal(image_distance(a, b, weight), image_distance(a.clone().requires_grad_(), b, weight).detach())
 
 
+@pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
+def test_a_weight_scales_value_and_gradient(ssim_weight):
+    a, b = pair(1, 3, 20, 17)
+    a.requires_grad_()
+    for target in (b, b.clone().requires_grad_()):
+        plain, weighted = image_distance(a, target, ssim_weight), image_distance(a, target, ssim_weight, weight=-0.3)
+        assert weighted.item() == pytest.approx(-0.3 * plain.item(), rel=1e-12)
+        gradients = [torch.autograd.grad(value, a)[0] for value in (weighted, plain)]
+        torch.testing.assert_close(gradients[0], -0.3 * gradients[1])
+
+
 def test_weight_zero_does_not_compute_ssim(monkeypatch):
     monkeypatch.setattr(image_loss, "_compiled_sums", lambda *_: pytest.fail("computed"))
     image_distance(*pair(1, 3, 12, 12), 0.0)

@@ -139,6 +139,16 @@ def test_a_larger_transform_sees_zeros_beyond_the_image(shape, size):
     torch.testing.assert_close(gradients[0], gradients[2], rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("norm", ["backward", "ortho"])
+def test_a_weight_scales_value_and_gradient(norm):
+    a, target = noise(1, 3, 9, 12).requires_grad_(), magnitude(noise(1, 3, 9, 12, seed=1))
+    for kept in (target, target.clone().requires_grad_()):
+        plain, weighted = magnitude_distance_to(a, kept, norm), magnitude_distance_to(a, kept, norm, weight=-0.3)
+        assert weighted.item() == pytest.approx(-0.3 * plain.item(), rel=1e-12)
+        gradients = [torch.autograd.grad(value, a)[0] for value in (weighted, plain)]
+        torch.testing.assert_close(gradients[0], -0.3 * gradients[1])
+
+
 def test_fast_sizes_have_small_prime_factors():
     assert fast_size(319, 480) == (320, 480) and fast_size(840, 1297) == (840, 1300) == fast_size(840, 1300)
     assert fast_size(1, 127) == (1, 128)
