@@ -26,6 +26,8 @@ _QUANTILE = 0.99
 _LEAST_OPACITY = 1e-30
 _LARGEST_DECAY = 1e15
 _FARTHEST = 1e18
+_FAINTEST = -85.0
+"""least exponent that is taken: exp of it is about the least normal number of float32"""
 _FADED = 100.0
 """a distance of more than this many sqrt(2) sigma counts as this many: exp(-1e4) is 0 in every dtype"""
 
@@ -110,12 +112,12 @@ class DistanceDecay:
         distance = normalised_distance(gaussians, camera, self.reference, self.scene_distance)
         exponent = log_decay(distance, decay_of(gaussians), self.scale)
         margin = _log_opacity(gaussians.opacities) + exponent - math.log(TAU * self.scale)
-        drawn = margin > 0
-        # of what is not drawn no exponential is taken: numbers under 1e-38 are a hundred times slower
-        weight = torch.exp(exponent.masked_fill(~drawn, 0.0))
+        # what is fainter is not drawn: numbers under 1e-38 would be a hundred times slower
+        weight = torch.exp(exponent.clamp_min(_FAINTEST))
         if not self.soft:
-            return weight * drawn
-        fade = torch.expm1(margin.clamp(0.0, math.log(2.0))).clamp_max(1.0)
+            return weight * (margin > 0)
+        # not expm1, which torch does not vectorise: where they differ, the fade is nothing
+        fade = (torch.exp(margin.clamp(0.0, math.log(2.0))) - 1.0).clamp_max(1.0)
         return weight * fade * fade * (3.0 - 2.0 * fade)
 
     def margin(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:

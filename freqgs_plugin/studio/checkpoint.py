@@ -102,5 +102,18 @@ def load_run(config_path: Path) -> Run:
     checkpoints = config_path.parent / "nerfstudio_models"
     if not any(checkpoints.glob("step-*.ckpt")):
         raise FileNotFoundError(f"{checkpoints} holds no step-*.ckpt; the run has not saved a checkpoint yet.")
-    config, pipeline, _, step = eval_setup(config_path, test_mode="test")
+
+    def found_here(config: Any) -> Any:
+        # a run's config names its folder as ns-train was told, which may be relative to where that was started
+        experiment, timestamp = config_path.resolve().parents[2], config_path.resolve().parent
+        config.output_dir, config.experiment_name = experiment.parent, experiment.name
+        config.timestamp = timestamp.name
+        if config.get_checkpoint_dir() != checkpoints.resolve():
+            raise FileNotFoundError(
+                f"{config_path} is of method {config.method_name}, and no folder above it is called so. "
+                f"Put it where ns-train did: EXPERIMENT/{config.method_name}/TIME/config.yml."
+            )
+        return config
+
+    config, pipeline, _, step = eval_setup(config_path, test_mode="test", update_config_callback=found_here)
     return Run(config, pipeline, step)

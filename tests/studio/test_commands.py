@@ -325,6 +325,20 @@ def test_a_run_is_loaded_as_plain_gaussians(trained):
         load_run(trained.parent / "nothing.yml")
 
 
+def test_a_run_is_loaded_from_where_it_lies(trained, tmp_path):
+    """Not from where its config says that it was written: that may be relative to another folder, or gone."""
+    from freqgs_plugin.studio.checkpoint import load_run
+
+    moved = tmp_path / "moved" / "renamed" / trained.parents[1].name / "again" / trained.name
+    shutil.copytree(trained.parent, moved.parent)
+    run = load_run(moved)
+    assert run.step == STEPS - 1 and run.config.load_dir == moved.parent / "nerfstudio_models"
+    elsewhere = tmp_path / "moved" / "renamed" / "other" / "again" / trained.name
+    shutil.copytree(trained.parent, elsewhere.parent)
+    with pytest.raises(FileNotFoundError, match=r"is of method lapsplat, and no folder above it is called so"):
+        load_run(elsewhere)
+
+
 def test_a_run_without_checkpoints(trained, tmp_path):
     from freqgs_plugin.studio.checkpoint import load_run
 

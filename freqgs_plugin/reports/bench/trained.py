@@ -27,6 +27,8 @@ def load(config_path: Path) -> Any:
             return load_run(config_path)
     except (FileNotFoundError, ValueError) as error:
         raise BenchError(str(error)) from error
+    except SystemExit as error:
+        raise BenchError(f"nerfstudio could not load {config_path}; `ns-eval --load-config` tells why") from error
 
 
 def views_of(run: Any) -> list[Any]:
