@@ -69,7 +69,7 @@ def _feature_groups(features: Tensor) -> list[Any]:
 
 class _Composite(torch.autograd.Function):
     """(splats, means2d probe, view matrix, background [d]) -> planes [prefixes, d, h, w] over the background, alpha
-    [prefixes, h, w], depth [h, w].
+    [prefixes, h, w], depth [h, w] (empty unless asked for).
     """
 
     @staticmethod
@@ -78,7 +78,7 @@ class _Composite(torch.autograd.Function):
         probe,
     ):  # fmt: skip
         shape = (view.prefixes, view.height, view.width)
-        alpha, depth = torch.empty(shape), torch.zeros(shape[1:])
+        alpha, depth = torch.empty(shape), torch.zeros(shape[1:] if with_depth else (0, 0))
         images = []
         backgrounds = _feature_groups(background[None])
         for number, group in enumerate(_feature_groups(features)):
@@ -221,9 +221,9 @@ class NumbaRasterizer:
             behind, view, depths, depth, means2d if wants_grad and self.absgrad else None,
         )  # fmt: skip
         alpha = alpha[..., None]
-        expected = z[..., None]
+        expected = alpha.new_zeros(()).expand(alpha.shape[1:])
         if depth:
-            expected = torch.where(alpha[0] > 0, expected / alpha[0].clamp_min(1e-10), 0.0).detach()
+            expected = torch.where(alpha[0] > 0, z[..., None] / alpha[0].clamp_min(1e-10), 0.0).detach()
         info = {
             "camera_ids": None,
             "gaussian_ids": None,

@@ -47,9 +47,9 @@ def render(
     weight = None
     if attenuation is not None:
         weight = attenuation(gaussians, camera)
-        keep = weight > 0
-        if not bool(keep.all()):
-            gaussians, weight = gaussians.select(keep), weight[keep]
+        rows = torch.where(weight > 0)[0]
+        if len(rows) < len(weight):
+            gaussians, weight = gaussians.select(rows), weight[rows]
     splats = shade(gaussians, camera, weight)
     rendering = rasterizer(splats, camera, background=background, antialiased=antialiased, depth=depth)
     return Rendering(rendering.features, rendering.alpha, rendering.depth, {**rendering.info, "drawn": len(splats)})
