@@ -41,7 +41,7 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
 
     _target: type = field(default_factory=lambda: ClodSplatModel)
     use_decay: bool = True
-    """learn a distance decay for each Gaussian; off: splatfacto's algorithm, to compare with"""
+    """learn a distance decay for each Gaussian; off: everything else stays as it is, to compare with"""
     decay_start_step: int = 5000
     """step from which opacities decay with distance (the paper)"""
     initial_decay: float = 5.0
