@@ -193,3 +193,15 @@ def test_seeds_are_trained_separately_and_shown_with_their_spread(tmp_path):
     (shown,), tools, _ = run(options)
     assert [training.seed for training in tools.trained] == [42, 42, 43, 43] and len(shown.results["room"]) == 2
     assert "±" in (options.output_dir / "clod.md").read_text()
+
+
+def test_sections_keep_the_seeds_that_are_finished(tmp_path):
+    run(options_in(tmp_path, only=("sigma", "ablation")))
+    options = options_in(tmp_path, only=("sigma",), seeds=2)
+    shown, _, _ = run(options)
+    assert {each.part.name: list(each.results["room"]) for each in shown} == {"ablation": [42], "sigma": [42, 43]}
+    page = (options.output_dir / "clod.md").read_text()
+    before, after = page.split("\n## What is learned")
+    assert before.count("Of seed 42 alone.") == 1 and "alone" not in after and "±" in after
+    sections = json.loads((options.output_dir / "clod.json").read_text())["sections"]
+    assert list(sections["sigma"]["room"]) == ["42", "43"] and list(sections["ablation"]["room"]) == ["42"]

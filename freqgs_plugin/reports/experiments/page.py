@@ -17,20 +17,24 @@ class Shown:
     """A section with its results."""
 
     part: Part
-    results: Mapping[str, Results]
-    """scene -> one per seed"""
+    results: Mapping[str, Mapping[int, Any]]
+    """scene -> seed -> what was measured; only seeds that are finished"""
+
+    def scenes(self) -> list[tuple[str, Results]]:
+        """Each scene with the results of its seeds."""
+        return [(scene, list(by_seed.values())) for scene, by_seed in self.results.items()]
 
     def goals(self) -> list[Goal]:
-        return [goal for scene, results in self.results.items() for goal in self.part.goals(scene, results)]
+        return [goal for scene, results in self.scenes() for goal in self.part.goals(scene, results)]
 
     def tables(self) -> list[BenchTable]:
-        return [table for scene, results in self.results.items() for table in self.part.tables(scene, results)]
+        return [table for scene, results in self.scenes() for table in self.part.tables(scene, results)]
 
     def figures(self) -> "dict[str, Figure]":
         """File name -> picture."""
         return {
             picture_name(self.part, scene, end): figure
-            for scene, results in self.results.items()
+            for scene, results in self.scenes()
             for end, figure in self.part.figures(scene, results).items()
         }
 
@@ -69,8 +73,10 @@ def markdown_page(record: Mapping[str, Any], shown: Sequence[Shown], pictures: s
         parts += ["## Goals", summary(goals), goal_markdown(goals)]
     for each in shown:
         parts += [f"## {each.part.title}", each.part.introduction]
-        for scene, results in each.results.items():
+        for scene, results in each.scenes():
             parts.append(f"### {each.part.title}: {scene}")
+            if (finished := list(each.results[scene])) != seeds:
+                parts.append(f"Of seed{'s' if len(finished) > 1 else ''} {', '.join(map(str, finished))} alone.")
             for end in each.part.figures(scene, results):
                 name = picture_name(each.part, scene, end)
                 parts.append(f"![{each.part.title}, {scene}]({pictures}{name})")

@@ -13,7 +13,7 @@ from freqgs_plugin.reports.experiments.lab import Lab, Missing, Tools
 from freqgs_plugin.reports.experiments.options import SECTIONS, ClodOptions, command_line
 from freqgs_plugin.reports.experiments.page import Shown, markdown_page
 from freqgs_plugin.reports.experiments.progress import Bars, Silent
-from freqgs_plugin.reports.experiments.section import Part, Results
+from freqgs_plugin.reports.experiments.section import Part
 from freqgs_plugin.reports.experiments.store import Store
 from freqgs_plugin.reports.experiments.training import ExperimentScene, Trial
 from freqgs_plugin.reports.tables import finite_json
@@ -67,15 +67,17 @@ def trials(options: ClodOptions, scene: ExperimentScene) -> list[Trial]:
 
 
 def collect(options: ClodOptions, scenes: Sequence[ExperimentScene], lab: Lab) -> list[Shown]:
-    """All sections, scene by scene, that are finished for every seed; `lab` does nothing anew."""
+    """All sections, scene by scene, with those seeds that are finished; `lab` does nothing anew."""
     shown = []
     for name in SECTIONS:
-        results: dict[str, Results] = {}
+        results: dict[str, dict[int, dict[str, Any]]] = {}
         for scene in scenes:
-            try:
-                results[scene.name] = [PARTS[name].measure(lab, t, options) for t in trials(options, scene)]
-            except Missing:
-                continue
+            for trial in trials(options, scene):
+                try:
+                    found = PARTS[name].measure(lab, trial, options)
+                except Missing:
+                    continue
+                results.setdefault(scene.name, {})[trial.seed] = found
         if results:
             shown.append(Shown(PARTS[name], results))
     return shown
