@@ -162,13 +162,14 @@ def normalised_distance(
         ValueError: the reference `scene` without a distance > 0.
     """
     _check_reference(reference, scene_distance)
-    distance, positions = _distances(gaussians, camera)
+    offsets = _offsets(gaussians, camera)
+    distance = _lengths(offsets)
     if reference == "scene":
         assert scene_distance is not None
         return distance / scene_distance
     if not len(distance):
         return distance
-    largest = _frustum_distance(distance, _in_frustum(positions, camera), reference)
+    largest = _frustum_distance(distance, _in_frustum(offsets, camera), reference)
     return torch.where(largest > 0, distance / torch.where(largest > 0, largest, 1.0), 0.0)
 
 
@@ -176,30 +177,36 @@ def frustum_distance(
     gaussians: Gaussians, camera: Camera, reference: Literal["frustum_max", "frustum_quantile"] = "frustum_max"
 ) -> float:
     """The distance that `normalised_distance` divides by for one view, world units; 0 without Gaussians."""
-    distance, positions = _distances(gaussians, camera)
-    return float(_frustum_distance(distance, _in_frustum(positions, camera), reference)) if len(distance) else 0.0
+    offsets = _offsets(gaussians, camera)
+    distance = _lengths(offsets)
+    return float(_frustum_distance(distance, _in_frustum(offsets, camera), reference)) if len(distance) else 0.0
 
 
 @torch.no_grad()
-def _distances(gaussians: Gaussians, camera: Camera) -> tuple[Float[Tensor, " n"], Float[Tensor, "3 n"]]:
-    """World distance of each mean from the camera's centre, and its position on the camera's axes."""
+def _offsets(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "3 n"]:
+    """From the camera's centre to each mean, on the world's axes."""
     means = _at_least_float32(gaussians.means)
-    # autocast would take these products at half precision
-    with torch.autocast(means.device.type, enabled=False):
-        viewmat = camera.viewmat.to(means)
-        # about a rounded camera centre, so that scenes far from the origin keep their digits
-        exact = camera.viewmat[:3].to("cpu", torch.float64)
-        centre = (-exact[:, :3].T @ exact[:, 3]).to(means)
-        rest = exact[:, 3] + exact[:, :3] @ centre.to("cpu", torch.float64)
-        positions = torch.addmm(rest[:, None].to(means), viewmat[:3, :3], (means - centre).T)
-    return torch.hypot(torch.hypot(positions[0], positions[1]), positions[2]), positions
+    # from a rounded centre, so that scenes far from the origin keep their digits; then what rounding took from it
+    exact = camera.viewmat[:3].to("cpu", torch.float64)
+    rotation, translation = exact[:, :3], exact[:, 3]
+    centre = (-(rotation.T @ translation)).to(means)
+    rest = rotation.T @ (translation + rotation @ centre.to(exact))
+    # axes first: what follows reads one axis at a time
+    offsets = means.new_empty(3, len(means))
+    return torch.sub(means.T, centre[:, None], out=offsets).add_(rest.to(means)[:, None])
+
+
+def _lengths(offsets: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
+    return torch.hypot(torch.hypot(offsets[0], offsets[1]), offsets[2])
 
 
 @torch.no_grad()
-def _in_frustum(positions: Float[Tensor, "3 n"], camera: Camera) -> Bool[Tensor, " n"]:
-    """Which means the image shows."""
-    x, y, z = positions
-    intrinsics = camera.K.to(positions)
+def _in_frustum(offsets: Float[Tensor, "3 n"], camera: Camera) -> Bool[Tensor, " n"]:
+    """Which means the image shows, by their offsets from the camera's centre."""
+    # autocast would take this product at half precision
+    with torch.autocast(offsets.device.type, enabled=False):
+        x, y, z = camera.viewmat[:3, :3].to(offsets) @ offsets
+    intrinsics = camera.K.to(offsets)
     front = z > NEAR_PLANE
     depth = torch.where(front, z, 1.0)
     u = x / depth * intrinsics[0, 0] + intrinsics[0, 2]
