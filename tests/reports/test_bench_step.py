@@ -9,7 +9,16 @@ from freqgs_plugin import cli
 from freqgs_plugin.demo.dataset import SceneOptions, write_scene
 from freqgs_plugin.reports import child as child_module
 from freqgs_plugin.reports.bench.options import BenchError, BenchOptions
-from freqgs_plugin.reports.bench.step import TICKS, outside, part_rows, run_profile, step_bench, step_table
+from freqgs_plugin.reports.bench.step import (
+    COMPOSITING,
+    RASTERIZER,
+    TICKS,
+    outside,
+    part_rows,
+    run_profile,
+    step_bench,
+    step_table,
+)
 from freqgs_plugin.studio.step_profile import REST, WARM_UP, Recorder, Sections
 
 
@@ -117,13 +126,22 @@ def test_rows_add_up_to_the_whole_and_the_largest_comes_first():
     assert sum(row["last_share"] for row in rows) == pytest.approx(1)
     adam = next(row for row in rows if row["part"] == "Adam")
     assert adam["milliseconds"] == pytest.approx({"1": 75.0, "2": 25.0}) and adam["share"] == pytest.approx(0.25)
-    assert outside(STAGES) == pytest.approx((0.35, 0.25))
+    assert outside(list(STAGES.values()), COMPOSITING) == pytest.approx(0.35)
+
+
+def test_the_rasterizer_is_more_than_its_two_kernels():
+    stages = [
+        {"seconds": 10.0, "parts": {"compositing": 4.0, "binning": 1.0, "projection, backward": 2.0, "Adam": 3.0}}
+    ]
+    assert outside(stages, COMPOSITING) == pytest.approx(0.6) and outside(stages, RASTERIZER) == pytest.approx(0.3)
 
 
 def test_table_ends_with_the_whole_step_and_names_what_is_outside_of_compositing():
     table = step_table(part_rows(STAGES), STAGES, 40)
     assert table.cells()[-1] == ["a whole step", "100", "200", "100.0 %", "100.0 %"]
-    assert "Outside compositing: 35.0 % of the whole run, 25.0 % of its last stage" in table.note
+    for what in ("Outside of the rasterizer (", "outside of its two compositing kernels alone: "):
+        said = table.note.partition(what)[2]
+        assert "35.0 % of the whole run, 25.0 % of its last stage" in said
     assert table.note.endswith("2 steps in which the system stopped the process are not counted.")
     assert "stage 2: 20 steps, 300 Gaussians" in table.note
 

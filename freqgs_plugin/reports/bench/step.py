@@ -5,7 +5,7 @@ import os
 import sys
 import tempfile
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,9 @@ from freqgs_plugin.reports.bench.tables import BenchTable, Row, number
 from freqgs_plugin.reports.child import child
 
 COMPOSITING = ("compositing", "compositing, backward")
+"""its two kernels"""
+RASTERIZER = (*COMPOSITING, "binning", "projection", "projection, backward", "rasterizer, around its kernels")
+"""all that a `Rasterizer` does, from splats to a picture and back"""
 TICKS = 20
 SEED = 42
 
@@ -90,19 +93,23 @@ def _last(by_stage: Mapping[str, Any]) -> Any:
     return by_stage[max(by_stage, key=int)]
 
 
-def outside(stages: Mapping[str, Any]) -> tuple[float, float]:
-    """Shares of the time outside of the compositing kernels: of the whole run, and of its last stage."""
-
-    def share(of: Sequence[Any]) -> float:
-        inside = sum(stage["parts"].get(name, 0.0) for stage in of for name in COMPOSITING)
-        return 1 - inside / sum(stage["seconds"] for stage in of)
-
-    return share(list(stages.values())), share([_last(stages)])
+def outside(stages: Sequence[Any], parts: Collection[str]) -> float:
+    """Share of these stages' time outside of `parts`."""
+    inside = sum(stage["parts"].get(name, 0.0) for stage in stages for name in parts)
+    return 1 - inside / sum(stage["seconds"] for stage in stages)
 
 
 def outside_compositing(stages: Mapping[str, Any]) -> str:
-    whole, last = outside(stages)
-    return f"outside compositing: {100 * whole:.1f} % of the whole run, {100 * last:.1f} % of its last stage"
+    """What is outside, by the narrowest meaning of compositing and by the widest."""
+
+    def shares(parts: Collection[str]) -> str:
+        whole, last = (100 * outside(of, parts) for of in (list(stages.values()), [_last(stages)]))
+        return f"{whole:.1f} % of the whole run, {last:.1f} % of its last stage"
+
+    return (
+        f"outside of the rasterizer (projection, binning and compositing, both directions): {shares(RASTERIZER)}; "
+        f"outside of its two compositing kernels alone: {shares(COMPOSITING)}"
+    )
 
 
 def step_table(rows: list[Row], stages: Mapping[str, Any], steps: int) -> BenchTable:
