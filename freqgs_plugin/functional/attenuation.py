@@ -111,14 +111,14 @@ class DistanceDecay:
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
         distance = normalised_distance(gaussians, camera, self.reference, self.scene_distance)
         exponent = log_decay(distance, decay_of(gaussians), self.scale)
-        margin = _log_opacity(gaussians.opacities) + exponent - math.log(TAU * self.scale)
+        margin = _log_opacity(gaussians.opacities).add_(exponent).sub_(math.log(TAU * self.scale))
         # what is fainter is not drawn: numbers under 1e-38 would be a hundred times slower
-        weight = torch.exp(exponent.clamp_min(_FAINTEST))
+        weight = exponent.clamp_min(_FAINTEST).exp_()
         if not self.soft:
             return weight * (margin > 0)
         # not expm1, which torch does not vectorise: where they differ, the fade is nothing
-        fade = (torch.exp(margin.clamp(0.0, math.log(2.0))) - 1.0).clamp_max(1.0)
-        return weight * fade * fade * (3.0 - 2.0 * fade)
+        fade = (margin.clamp(0.0, math.log(2.0)).exp_() - 1.0).clamp_max(1.0)
+        return (weight * fade).mul_(fade).mul_((-2.0 * fade).add_(3.0))
 
     def margin(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
         """ln α'' - ln(τ s) of every Gaussian: it is drawn where this is positive."""
@@ -131,9 +131,10 @@ def log_decay(distance: Float[Tensor, " n"], decay: Float[Tensor, " n"], scale: 
     """-(d' s)^2 / (2 max(σ, 0)^2 + ε), at least -1e4: the exponent of Eq. 2, with finite gradients for any σ."""
     distance, decay = _at_least_float32(distance), _at_least_float32(decay)
     far = (distance * min(float(scale), _FARTHEST)).clamp_max(_FARTHEST)
+    # in place where no derivative needs what was there: each array that is not made is one that need not be fetched
+    reach = decay.clamp(0.0, _LARGEST_DECAY).square().mul_(2.0).add_(EPSILON).sqrt_()
     # squared last: the quotient and its derivatives stay in range where the squares would not
-    ratio = far / (2.0 * decay.clamp(0.0, _LARGEST_DECAY).square() + EPSILON).sqrt()
-    return -ratio.clamp_max(_FADED).square()
+    return (far / reach).clamp_max(_FADED).square().neg_()
 
 
 def log_attenuated(
@@ -186,14 +187,25 @@ def frustum_distance(
 def _offsets(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "3 n"]:
     """From the camera's centre to each mean, on the world's axes."""
     means = _at_least_float32(gaussians.means)
+    centre = _exact_centre(camera)
     # from a rounded centre, so that scenes far from the origin keep their digits; then what rounding took from it
-    exact = camera.viewmat[:3].to("cpu", torch.float64)
-    rotation, translation = exact[:, :3], exact[:, 3]
-    centre = (-(rotation.T @ translation)).to(means)
-    rest = rotation.T @ (translation + rotation @ centre.to(exact))
+    rounded = centre.to(means)
+    rest = rounded.to(centre) - centre
     # axes first: what follows reads one axis at a time
     offsets = means.new_empty(3, len(means))
-    return torch.sub(means.T, centre[:, None], out=offsets).add_(rest.to(means)[:, None])
+    return torch.sub(means.T, rounded[:, None], out=offsets).add_(rest.to(means)[:, None])
+
+
+def _exact_centre(camera: Camera) -> Float[Tensor, " 3"]:
+    """Where the view matrix takes to 0, in float64 on the CPU.
+
+    -R^T t is that only as far as the rotation, rounded to float32, is orthonormal: 1e6 units away it is wrong by 0.1.
+    """
+    rotation, translation = camera.viewmat[:3].to("cpu", torch.float64).split(3, -1)
+    centre = -(rotation.T @ translation)
+    for _ in range(2):
+        centre -= rotation.T @ (translation + rotation @ centre)
+    return centre[:, 0]
 
 
 def _lengths(offsets: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:

@@ -48,8 +48,10 @@ def plain_weight(
 
 
 def _normalised(means: Tensor, view: Camera, reference: Reference) -> Tensor:
-    points = means.detach() @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-    distance = points.norm(dim=-1)
+    rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
+    # rounded to float32, the rotation also stretches by up to 1e-7: lengths are those of the world, not of its image
+    distance = (means.detach() - torch.linalg.solve(rotation, -translation)).norm(dim=-1)
+    points = means.detach() @ rotation.T + translation
     if reference == "scene" or not len(distance):
         return distance / SCENE_DISTANCE
     pixels = points[:, :2] / points[:, 2:] @ view.K[:2, :2].T + view.K[:2, 2]
