@@ -4,6 +4,7 @@ Levels are an integer tensor, not a parameter: gsplat's operators copy tensors o
 rows that they duplicate, split or remove, so the tags travel there.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,6 +19,8 @@ from freqgs_plugin.training.schedule import Schedule
 Growth = Literal["all", "newest", "own_prefix"]
 _MOST_DROPPED = 0.9
 """share of all Gaussians above which `drop_unneeded` removes none"""
+_TOP = 0.9
+"""quantile of opacity that stands for Gaussians that are needed"""
 
 
 @dataclass
@@ -28,7 +31,8 @@ class LevelStrategy(DefaultStrategy):
     """which Gaussians may grow: `all` from the full image's gradient, only those of the `newest` level, or each level
     from the gradient of its `own_prefix`"""
     lower_prune_opa: float = 0.005
-    """prune threshold of levels under the newest"""
+    """prune threshold of levels under the newest; what is over `prune_opa` stays, too, if it is over half of the 0.9
+    quantile of theirs: where all are faint, after a reset or at small learning rates, that says nothing about one"""
     reset_levels: Literal["all", "newest"] = "all"
     """whose opacities are reset"""
     max_gaussians: int = 0
@@ -84,14 +88,20 @@ class LevelStrategy(DefaultStrategy):
     @torch.no_grad()
     def _prune(self, params, optimizers: Any, state: dict[str, Any], step: int, stage: int) -> int:
         opacity = torch.sigmoid(params["opacities"].flatten())
-        threshold = torch.where(state["level"] < stage, self.lower_prune_opa, self.prune_opa)
-        prune = opacity < threshold
+        lower = state["level"] < stage
+        prune = opacity < torch.where(lower, self._lower_threshold(opacity[lower]), self.prune_opa)
         if step > self.reset_every:
             largest = torch.exp(params["scales"]).amax(-1)
             prune |= largest > self.prune_scale3d * state["scene_scale"]
             if step < self.refine_scale2d_stop_iter:
                 prune |= state["radii"] > self.prune_scale2d
         return self.remove(params, optimizers, state, prune, opacity)
+
+    def _lower_threshold(self, opacity: Float[Tensor, " n"]) -> float:
+        if self.lower_prune_opa <= self.prune_opa or not len(opacity):
+            return self.lower_prune_opa
+        top = opacity.kthvalue(math.ceil(_TOP * len(opacity))).values
+        return min(self.lower_prune_opa, max(self.prune_opa, float(top) / 2))
 
     @torch.no_grad()
     def drop_unneeded(

@@ -112,6 +112,27 @@ def test_prune_thresholds_by_level_and_no_level_dies_out():
     assert state["level"].tolist() == [1, 2]
 
 
+@pytest.mark.parametrize(
+    "opacities, left",
+    [
+        # half of the highest is 0.45: 0.22 holds
+        ([0.05, 0.12, 0.21, 0.23, 0.9], [3, 4]),
+        # half of the highest is 0.15
+        ([0.05, 0.12, 0.16, 0.21, 0.3], [2, 3, 4]),
+        # as after a reset: half of the highest is under what the newest level needs
+        ([0.05, 0.12, 0.16, 0.17, 0.19], [1, 2, 3, 4]),
+    ],
+)
+def test_lower_levels_stay_where_all_of_them_are_faint(opacities, left):
+    params, optimizers, state = scene([1] * 5 + [2])
+    with torch.no_grad():
+        params["opacities"][:] = torch.tensor([*opacities, 0.99])[:, None].logit()
+    s = strategy(lower_prune_opa=0.22)
+    s.observe(state, info([[0.0, 0.0]] * 6), None)
+    s.step(params, optimizers, state, 110, SCHEDULE)
+    assert parents(params) == [*left, 5]
+
+
 def test_reset_clamps_opacities_and_forgets_their_momentum():
     params, optimizers, state = scene([1, 2], opacity=0.9)
     s = strategy(reset_levels="newest")
