@@ -14,7 +14,7 @@ from rich.console import Console
 
 from freqgs_plugin import cli
 from freqgs_plugin.rendering.base import PrefixRasterizer, get_rasterizer
-from freqgs_plugin.reports.bench import cuda, raster, runner
+from freqgs_plugin.reports.bench import cuda, raster, raster_threads, runner
 from freqgs_plugin.reports.bench.fit import asymptotic, fit
 from freqgs_plugin.reports.bench.memory import peak_mib
 from freqgs_plugin.reports.bench.options import BenchError, BenchOptions
@@ -273,7 +273,7 @@ def test_bench_commands_are_listed_and_refused_by_name(capsys):
 
 def test_raster_from_the_command_line(tmp_path, capsys):
     page = tmp_path / "page.md"
-    names = ("raster", "raster-prefixes", "raster-shares")
+    names = ("raster", "raster-prefixes", "raster-shares", "raster-threads")
     page.write_text("\n".join(f"<!-- {name} -->\n<!-- end of {name} -->" for name in names))
     cli.main(["bench", "raster", "--quick", "--rounds", "1", "--output-dir", str(tmp_path), "--docs", str(page)])
     tables = json.loads((tmp_path / "raster.json").read_text())["tables"]
@@ -288,8 +288,17 @@ def test_raster_from_the_command_line(tmp_path, capsys):
     assert shares["everything"] == 1 and shares["level 1 of 3"] < shares["levels 1-2 of 3"] < 1
     decays = [shares[f"distance decay, scale {s}"] for s in (1, 2, 5)]
     assert decays == sorted(decays, reverse=True) and decays[-1] < 0.5
-    assert page.read_text().count("| --- |") == 3
+    threads = tables["raster-threads"]["rows"]
+    assert {row["workload"] for row in threads} == set(NAMES) and all(row["same_bits"] for row in threads)
+    assert all(row["forward_backward_ratio"] == 1 for row in threads if row["threads"] == 1)
+    assert page.read_text().count("| --- |") == 4
     assert "Rasterizers" in capsys.readouterr().out
+
+
+def test_thread_counts_are_powers_of_two(monkeypatch):
+    for most, expected in ((1, [1]), (2, [1, 2]), (6, [1, 2, 4]), (8, [1, 2, 4, 8])):
+        monkeypatch.setattr(raster_threads.numba.config, "NUMBA_NUM_THREADS", most)
+        assert raster_threads.thread_counts() == expected
 
 
 def test_the_cuda_bench_needs_a_device(monkeypatch, capsys):

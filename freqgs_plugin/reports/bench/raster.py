@@ -11,6 +11,7 @@ from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
 from freqgs_plugin.rendering.render import render
 from freqgs_plugin.reports.bench.memory import peak_memory
 from freqgs_plugin.reports.bench.options import BenchOptions
+from freqgs_plugin.reports.bench.raster_threads import thread_rows, thread_table
 from freqgs_plugin.reports.bench.runner import Bench, Measured, Tick
 from freqgs_plugin.reports.bench.tables import BenchTable, Column, Row, milliseconds, number, ratio
 from freqgs_plugin.reports.bench.workloads import (
@@ -44,12 +45,15 @@ def raster_bench(options: BenchOptions) -> Bench:
                 backend_table([row for name in NAMES for row in backend_rows(name, contenders, options, tick)]),
                 prefix_table([row for name in PREFIX_WORKLOADS for row in prefix_rows(name, options, tick)]),
                 share_table(share_rows("large", options, tick)),
+                thread_table(
+                    threads := [row for name in NAMES for row in thread_rows(name, options, tick)], sizes_of(threads)
+                ),
             ],
             {"scene": SCENE_SEED, "image gradient": IMAGE_SEED, "levels and decays": DETAIL_SEED},
         )
 
-    steps = len(NAMES) * (len(contenders) + 1) + len(PREFIX_WORKLOADS) + 1
-    return Bench("raster", ("raster", "raster-prefixes", "raster-shares"), steps, measure)
+    steps = len(NAMES) * (len(contenders) + 1) + len(PREFIX_WORKLOADS) + 1 + len(NAMES)
+    return Bench("raster", ("raster", "raster-prefixes", "raster-shares", "raster-threads"), steps, measure)
 
 
 def backends() -> list[tuple[str, str]]:
