@@ -1,0 +1,23 @@
+"""The code on docs/applications.md, run as it is written."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).parents[2] / "docs" / "applications.md"
+
+
+@pytest.mark.slow
+def test_the_code_on_the_page_runs(trained, tmp_path, monkeypatch, capsys):
+    (tmp_path / "RUN").symlink_to(trained.parent, target_is_directory=True)
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.S)
+    assert len(blocks) == 4
+    names = {}
+    for block in blocks:
+        exec(compile(block, str(PAGE), "exec"), names)
+    assert (tmp_path / "level-1.png").stat().st_size > 0
+    assert re.search(r"^[\d,]+ of [\d,]+ Gaussians$", capsys.readouterr().out, flags=re.M)
+    assert names["picture"].features.shape[:2] == (names["camera"].height, names["camera"].width)
+    assert names["distance"].min() >= 0 and (names["run"].gaussians.level[names["row"]] == 1).all()
