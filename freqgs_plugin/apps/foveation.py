@@ -1,6 +1,7 @@
 """Detail where one looks: weights that fall off around a gaze, the faster the finer the level.
 
-Section 4.5 and supplement 1.2 of the Laplacian-pyramid paper, which names neither threshold nor widths: both are ours.
+Section 4.5 and supplement 1.2 of the Laplacian-pyramid paper, which names neither threshold nor widths: both are ours,
+and so is the disc in which nothing is taken away.
 """
 
 import math
@@ -20,16 +21,18 @@ _FAR = 1e6
 
 @dataclass(frozen=True)
 class Foveation:
-    """An attenuation for one gaze: level k is weighted by a 2D Gaussian around it, evaluated at projected centres.
+    """An attenuation for one gaze: a Gaussian's weight falls with the distance from a disc around it to its centre.
 
     The standard deviation of level k of L is `sigma` 2^(L-k): it halves from level to level, and is `sigma` at the
-    finest. Level 1 is drawn everywhere, with weight 1.
+    finest. In the disc, and of level 1 everywhere, the weight is 1. With `radius` 0 it is the paper's.
     """
 
     gaze: tuple[float, float]
     """where one looks: shares of the image's width and height, from its upper left corner. It may lie outside"""
     sigma: float | int = 0.1
     """standard deviation of the finest level, share of the image's longer side, > 0"""
+    radius: float | int = 0.1
+    """of the disc, share of the image's longer side, >= 0"""
     threshold: float | int = TAU
     """opacity times weight under which a Gaussian is left out before it is projected, [0, 1]"""
 
@@ -38,6 +41,8 @@ class Foveation:
             raise ValueError(f"gaze is {self.gaze}; it must be two numbers (0.5, 0.5 is the middle of the image).")
         if not 0 < self.sigma < math.inf:
             raise ValueError(f"sigma is {self.sigma}; it must be a finite number > 0 (a share of the longer side).")
+        if not 0 <= self.radius < math.inf:
+            raise ValueError(f"radius is {self.radius}; it must be a finite number >= 0 (a share of the longer side).")
         if not 0 <= self.threshold <= 1:
             raise ValueError(f"threshold is {self.threshold}; it must be an opacity from 0 to 1.")
 
@@ -47,8 +52,8 @@ class Foveation:
         level = gaussians.level
         finest = int(level.max())
         above = (finest - level).to(gaussians.opacities.dtype)
-        exponent = -0.5 * (self._eccentricity(gaussians, camera) / (self.sigma * torch.exp2(above))).square()
-        weight = torch.exp(exponent)
+        outside = (self._eccentricity(gaussians, camera) - self.radius).clamp_min(0.0)
+        weight = torch.exp(-0.5 * (outside / (self.sigma * torch.exp2(above))).square())
         weight = torch.where(gaussians.opacities * weight > self.threshold, weight, 0.0)
         return torch.where(level > 1, weight, 1.0)
 
