@@ -205,3 +205,15 @@ def test_sections_keep_the_seeds_that_are_finished(tmp_path):
     assert before.count("Of seed 42 alone.") == 1 and "alone" not in after and "±" in after
     sections = json.loads((options.output_dir / "clod.json").read_text())["sections"]
     assert list(sections["sigma"]["room"]) == ["42", "43"] and list(sections["ablation"]["room"]) == ["42"]
+
+
+def test_a_page_of_what_is_there_trains_nothing(tmp_path):
+    options = options_in(tmp_path, only=("sigma",))
+    run(options)
+    (options.output_dir / "clod.md").unlink()
+    shown, tools, _ = run(options_in(tmp_path, seeds=2, page_only=True))
+    assert tools.trained == [] and [each.part.name for each in shown] == ["sigma"]
+    page = (options.output_dir / "clod.md").read_text()
+    assert "Of seed 42 alone." in page and "--page-only" not in page
+    with pytest.raises(ExperimentError, match="holds no finished section"):
+        run(options_in(tmp_path, steps=77, page_only=True))

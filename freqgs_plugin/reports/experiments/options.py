@@ -38,6 +38,8 @@ class ClodOptions:
     """photographs of the demo scene"""
     size: tuple[int, int] = (320, 240)
     """width and height of the demo scene's photographs, pixels"""
+    page_only: bool = False
+    """train and measure nothing: write the page and pictures of what the folder holds"""
     docs: Path | None = None
     """also write the page there, and its pictures into images/ beside it"""
 
@@ -71,7 +73,7 @@ def command_line(options: ClodOptions) -> str:
     command = ["freqgs", "experiment", "clod"]
     for field in fields(options):
         value: Any = getattr(options, field.name)
-        if value == field.default or field.name in ("output_dir", "docs", "only"):
+        if value == field.default or field.name in ("output_dir", "docs", "only", "page_only"):
             continue
         name = field.name.replace("_", "-")
         if isinstance(value, bool):

@@ -35,7 +35,8 @@ many Gaussians as clodsplat draws at s_v = {DEFAULT_SCALE:g}.
 * *sweep*: s_v rises from 1 to {DEFAULT_SCALE:g} in equal steps, seen from the middle held-out view.
 * *dolly*: the camera goes away in a straight line, distance growing more than tenfold by equal factors, at s_v =
   {HELD_SCALE:g}. In the demo scene from the dice to the wall; elsewhere on the line through the middle held-out view
-  and what it looks at. The camera's own motion changes every frame: *{CAMERA}* shows how much.
+  and what it looks at. The camera's own motion changes every frame: *{CAMERA}* shows how much. Where that jumps, too,
+  the camera goes through Gaussians (in the demo scene those of a wall, and floaters): no work of the level of detail.
 * *fading alone*: each frame of the dolly against the same frame with the weights of the frame before, so without the
   camera's motion."""
 

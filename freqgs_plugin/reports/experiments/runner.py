@@ -10,7 +10,7 @@ from freqgs_plugin.reports.bench.runner import IMAGES, png, write_all
 from freqgs_plugin.reports.experiments import ablation, budget, curve, pops, sigma
 from freqgs_plugin.reports.experiments.goals import goal_table
 from freqgs_plugin.reports.experiments.lab import Lab, Missing, Tools
-from freqgs_plugin.reports.experiments.options import SECTIONS, ClodOptions, command_line
+from freqgs_plugin.reports.experiments.options import SECTIONS, ClodOptions, ExperimentError, command_line
 from freqgs_plugin.reports.experiments.page import Shown, markdown_page
 from freqgs_plugin.reports.experiments.progress import Bars, Silent
 from freqgs_plugin.reports.experiments.section import Part
@@ -35,30 +35,57 @@ def run_clod(options: ClodOptions, scenes: Sequence[ExperimentScene], tools: Too
     out = options.output_dir
     out.mkdir(parents=True, exist_ok=True)
     store, log = Store(out / "steps"), out / "load.log"
-    shown: list[Shown] = []
-    files: dict[Path, bytes] = {}
-    try:
-        with Bars(console, "freqgs experiment clod", len(options.sections) * len(scenes) * options.seeds) as bars:
-            lab = Lab(store, tools, bars, log)
-            for name in options.sections:
-                for scene in scenes:
-                    for trial in trials(options, scene):
-                        bars.part(f"{name}: {scene.name}, seed {trial.seed}")
-                        PARTS[name].measure(lab, trial, options)
-                        bars.advance()
-                finished = Lab(store, tools, Silent(), log, only_finished=True)
-                shown = collect(options, scenes, finished)
-                files = _files(options, _record(options, finished), shown)
-                write_all(files)
-    except KeyboardInterrupt:
-        _say(console, f"Stopped. What is finished is kept in {store.folder}; the same command goes on from there.")
-        raise
+    if options.page_only:
+        shown, files = _report(options, scenes, Lab(store, tools, Silent(), log, only_finished=True))
+    else:
+        try:
+            shown, files = _measure(options, scenes, store, tools, log, console)
+        except KeyboardInterrupt:
+            _say(console, f"Stopped. What is finished is kept in {store.folder}; the same command goes on from there.")
+            raise
     goals = [goal for each in shown for goal in each.goals()]
     if goals:
         console.print(goal_table(goals))
     for path in files:
         _say(console, str(path))
     return shown
+
+
+Report = tuple[list[Shown], Mapping[Path, bytes]]
+"""sections, and the files that show them"""
+
+
+def _measure(
+    options: ClodOptions, scenes: Sequence[ExperimentScene], store: Store, tools: Tools, log: Path, console: "Console"
+) -> Report:
+    """Every section in turn, with a report after each."""
+    report: Report = ([], {})
+    with Bars(console, "freqgs experiment clod", len(options.sections) * len(scenes) * options.seeds) as bars:
+        lab = Lab(store, tools, bars, log)
+        for name in options.sections:
+            for scene in scenes:
+                for trial in trials(options, scene):
+                    bars.part(f"{name}: {scene.name}, seed {trial.seed}")
+                    PARTS[name].measure(lab, trial, options)
+                    bars.advance()
+            report = _report(options, scenes, Lab(store, tools, Silent(), log, only_finished=True))
+    return report
+
+
+def _report(options: ClodOptions, scenes: Sequence[ExperimentScene], finished: Lab) -> Report:
+    """Write all that is known for these settings.
+
+    Raises:
+        ExperimentError: nothing is.
+    """
+    shown = collect(options, scenes, finished)
+    if not shown:
+        raise ExperimentError(
+            f"{options.output_dir} holds no finished section of these scenes and settings; leave out --page-only"
+        )
+    files = _files(options, _record(options, finished), shown)
+    write_all(files)
+    return shown, files
 
 
 def trials(options: ClodOptions, scene: ExperimentScene) -> list[Trial]:
