@@ -12,6 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from fake_lab import SCENE, FakeTools, fake_lab
 
+from freqgs_plugin.reports.experiments import runner
 from freqgs_plugin.reports.experiments.lab import Missing
 from freqgs_plugin.reports.experiments.options import ClodOptions, ExperimentError
 from freqgs_plugin.reports.experiments.runner import run_clod
@@ -126,6 +127,12 @@ def test_two_loaded_runs_are_kept(tmp_path):
     for training in (trainings[0], trainings[0], trainings[1], trainings[0], trainings[2], trainings[0], trainings[1]):
         lab.run(training)
     assert len(tools.loaded) == 4, "the second one was dropped for the third, and read again"
+
+
+@pytest.fixture(autouse=True)
+def blank_pictures(monkeypatch):
+    """Drawing them takes seconds each time; test_experiments.py draws them once."""
+    monkeypatch.setattr(runner, "png", lambda figure: b"PNG" if figure.axes else b"")
 
 
 # -- the whole experiment ---------------------------------------------------------------------------------------------
