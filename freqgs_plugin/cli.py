@@ -135,7 +135,7 @@ def _expected(error: Exception) -> bool:
     from freqgs_plugin.reports.stability.runner import StabilityError
 
     ours = (TrainingError, SceneError, StabilityError, BenchError, ExperimentError)
-    return isinstance(error, (FileExistsError, *ours))
+    return isinstance(error, (OSError, *ours))
 
 
 if __name__ == "__main__":

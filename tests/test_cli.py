@@ -57,6 +57,17 @@ def test_unexpected_errors_keep_their_traceback(tmp_path, monkeypatch):
         cli.main(["demo", "--output-dir", str(tmp_path / "out")])
 
 
+@pytest.mark.parametrize(
+    "command", [["bench", "raster", "--quick"], ["stability", "--quick"], ["experiment", "clod", "--views", "2"]]
+)
+def test_places_that_cannot_be_written_are_named_before_the_work(tmp_path, capsys, command):
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*command, "--output-dir", str(tmp_path / "file" / "out")])
+    error = capsys.readouterr().err
+    assert stop.value.code == 1 and "nothing can be written there" in error and str(tmp_path / "file" / "out") in error
+
+
 def test_an_interrupt_says_how_to_go_on_and_exits_with_130(tmp_path, monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt

@@ -32,10 +32,12 @@ def clod(options: Options = ClodOptions()) -> None:  # noqa: B008
 
     from rich.console import Console
 
+    from freqgs_plugin.reports.bench.runner import check_folder
     from freqgs_plugin.reports.experiments.lab import Tools
     from freqgs_plugin.reports.experiments.runner import run_clod
 
     scenes = [scene_of(folder) for folder in options.scenes]
+    check_folder(options.output_dir)
     if options.demo:
         scenes.append(demo_scene(options))
     runs = options.output_dir / "runs"

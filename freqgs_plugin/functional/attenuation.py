@@ -200,12 +200,15 @@ def _exact_centre(camera: Camera) -> Float[Tensor, " 3"]:
     """Where the view matrix takes to 0, in float64 on the CPU.
 
     -R^T t is that only as far as the rotation, rounded to float32, is orthonormal: 1e6 units away it is wrong by 0.1.
+
+    Raises:
+        ValueError: there is no such place, as the matrix is singular.
     """
-    rotation, translation = camera.viewmat[:3].to("cpu", torch.float64).split(3, -1)
-    centre = -(rotation.T @ translation)
-    for _ in range(2):
-        centre -= rotation.T @ (translation + rotation @ centre)
-    return centre[:, 0]
+    exact = camera.viewmat[:3].to("cpu", torch.float64)
+    try:
+        return torch.linalg.solve(exact[:, :3], -exact[:, 3])
+    except torch.linalg.LinAlgError as error:
+        raise ValueError(f"the camera's viewmat has no inverse: {exact.tolist()}. Check the camera's pose.") from error
 
 
 def _lengths(offsets: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
@@ -254,6 +257,11 @@ def decay_of(gaussians: Gaussians) -> Float[Tensor, " n"]:
         raise ValueError(
             "these Gaussians have no decay, so distance cannot fade them. Train them with clodsplat, or give them one "
             "(`dataclasses.replace(gaussians, decay=...)`)."
+        )
+    if gaussians.decay.shape != gaussians.opacities.shape:
+        raise ValueError(
+            f"decay has the shape {list(gaussians.decay.shape)}, and opacities {list(gaussians.opacities.shape)}; "
+            "every Gaussian needs one of each."
         )
     return gaussians.decay
 

@@ -33,7 +33,9 @@ TIE = 2e-6
 """cut-offs that differ by a smaller share count as equal: float32 cannot tell on which side of them a scale is"""
 _FEW = 4096
 _FADE = 0.25
-"""Gaussians fade in between 1 and this much more than 1 times the measure at which they are left out"""
+"""Gaussians fade in between 1 and at most this much more than 1 times the measure at which they are left out"""
+_WHOLE = 0.75
+"""share of a budget that is drawn without fading, however near to each other the measures are"""
 _BLUR = 0.3 + 0.1
 """px^2: the rasterizers' blur, and the floor of gsplat's eigenvalue"""
 
@@ -103,9 +105,9 @@ class LevelBudget:
     """Whole levels as long as they fit into `count` Gaussians of a view, then the part of the next one that shows most.
 
     `LevelCut` at a fraction would draw all of the next level, faded; a budget has to leave some out. Those with the
-    largest opacity times area on the screen stay. They fade in between 1 and 1.25 times the measure at which they are
-    left out, so that nothing pops as the camera moves. Where not even level 1 fits, it is drawn in part. Gaussians out
-    of view have weight 0.
+    largest opacity times area on the screen stay. The last quarter of them at most fades, between 1 and 1.25 times the
+    measure at which they are left out, so that nothing pops as the camera moves; of equal ones the first stay. Where
+    not even level 1 fits, it is drawn in part. Gaussians out of view have weight 0.
     """
 
     count: float | int
@@ -306,13 +308,16 @@ def _most_visible(
         return out
     shown = weight[rows]
     measure = _visibility(gaussians.select(rows), camera) * shown.detach()
+    # of those that are left out, the one that shows most
     cut = measure.kthvalue(len(rows) - count).values
-    if soft:
-        excess = measure / cut.clamp_min(torch.finfo(measure.dtype).tiny) - 1.0
-        fade = (excess / _FADE).clamp(0.0, 1.0)
+    whole = measure.kthvalue(len(rows) + 1 - math.ceil(_WHOLE * count)).values.minimum(cut * (1.0 + _FADE))
+    if soft and whole > cut:
+        fade = ((measure - cut) / (whole - cut)).clamp(0.0, 1.0)
         out[rows] = shown * fade * fade * (3.0 - 2.0 * fade)
     else:
-        out[rows] = shown * (measure > cut)
+        # of equal ones, the first
+        above, equal = measure > cut, measure == cut
+        out[rows] = shown * (above | (equal & (equal.cumsum(0) <= count - above.sum())))
     return out
 
 

@@ -150,7 +150,7 @@ def _read_checkpoint(path: Path) -> tuple[RawGaussians, int]:
     if not isinstance(content, dict) or not isinstance(content.get("pipeline"), dict):
         raise SplatFileError(f"{path} is no checkpoint of nerfstudio's trainer: it holds no 'pipeline'. Name another.")
     # distributed training puts `module.` into the names
-    tensors = {name.replace("module.", ""): value for name, value in content["pipeline"].items()}
+    tensors = {str(name).replace("module.", ""): value for name, value in content["pipeline"].items()}
     prefix = _PREFIX if f"{_PREFIX}means" in tensors else _OLD_PREFIX
     missing = [name for name in GROUPS if not isinstance(tensors.get(prefix + name), Tensor)]
     if missing:
@@ -170,7 +170,10 @@ def _read_checkpoint(path: Path) -> tuple[RawGaussians, int]:
     level, decay = tensors.get("_model.level"), tensors.get(f"{_PREFIX}decay")
     raw = _shaped(path, {name: tensors[prefix + name] for name in GROUPS}, level, decay)
     _check_values(path, raw)
-    return raw, int(content.get("step", 0))
+    step = content.get("step", 0)
+    if not isinstance(step, int):
+        raise SplatFileError(f"{path}: its step is {step!r}, no whole number; name another checkpoint of the run.")
+    return raw, step
 
 
 def _load(path: Path) -> Any:
@@ -228,6 +231,8 @@ def _shaped(path: Path, tensors: dict[str, Tensor], level: Any, decay: Any) -> R
                 "method. Export a 3DGS PLY with that method's own commands, and start from it."
             )
     for name, extra in (("level", level), ("decay", decay)):
+        if extra is not None and not isinstance(extra, Tensor):
+            raise SplatFileError(f"{path}: {name} is no tensor but {extra!r:.60}; the run is damaged.")
         if extra is not None and extra.numel() != n:
             raise SplatFileError(f"{path}: {name} has {extra.numel()} values for {n} Gaussians; the run is damaged.")
     return RawGaussians(

@@ -107,15 +107,19 @@ def check_inputs(splats: Splats, camera: Camera) -> None:
     """Refuse what no picture can be made of: every backend calls this first.
 
     Raises:
-        ValueError: a number that is not finite, an image without pixels, or a focal length that is not positive.
-        TypeError: tensors of several dtypes.
+        ValueError: a shape that does not fit the others, a number that is not finite, an image without pixels, or a
+            focal length that is not positive.
+        TypeError: tensors of several dtypes, or a side that is no whole number.
     """
+    _check_shapes(splats, camera)
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"camera is {camera.width}x{camera.height} px; both sides must be at least 1.")
     for name in ("viewmat", "K"):
         rows = getattr(camera, name).tolist()
         if not all(math.isfinite(x) for row in rows for x in row):
             raise ValueError(f"the camera's {name} is not finite: {rows}. Check the camera's pose and model.")
+        if name == "viewmat" and _determinant(rows) == 0:
+            raise ValueError(f"the camera's viewmat has no inverse: {rows}. Check the camera's pose.")
         if name == "K" and not min(rows[0][0], rows[1][1]) > 0:
             raise ValueError(f"focal lengths are {rows[0][0]:g} and {rows[1][1]:g} px; both must be > 0.")
     tensors: dict[str, Tensor] = {
@@ -138,6 +142,32 @@ def check_inputs(splats: Splats, camera: Camera) -> None:
                 f"{values[first].tolist()}). Remove these Gaussians; in training, lower the learning rates, or go back "
                 "to a checkpoint before they appeared."
             )
+
+
+def _determinant(rows: list[list[float]]) -> float:
+    """Of the upper left 3 by 3 entries."""
+    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in rows[:3])
+    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
+def _check_shapes(splats: Splats, camera: Camera) -> None:
+    """Compiled kernels read as far as the means tell them to."""
+    n = len(splats.means)
+    sides = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    for name, expected in sides.items():
+        if tuple(getattr(splats, name).shape) != expected:
+            found = list(getattr(splats, name).shape)
+            raise ValueError(f"{name} have the shape {found}; with {n} means it must be {list(expected)}.")
+    if splats.features.dim() != 2 or len(splats.features) != n:
+        raise ValueError(f"features have the shape {list(splats.features.shape)}; with {n} means it must be [{n}, d].")
+    for name, side in (("viewmat", 4), ("K", 3)):
+        if tuple(getattr(camera, name).shape) != (side, side):
+            raise ValueError(
+                f"the camera's {name} has the shape {list(getattr(camera, name).shape)}, not [{side}, {side}]."
+            )
+    for name in ("width", "height"):
+        if not isinstance(getattr(camera, name), int):
+            raise TypeError(f"the camera's {name} is {getattr(camera, name)!r}; it must be a whole number of pixels.")
 
 
 def check_levels(level: Int[Tensor, " n"], num_levels: int) -> None:

@@ -1,6 +1,8 @@
 """A child process whose output is read line by line."""
 
+import signal
 import subprocess
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -12,8 +14,32 @@ PATIENCE = 20
 def child(command: Sequence[str], env: Mapping[str, str] | None = None) -> "Iterator[subprocess.Popen[str]]":
     """Run `command` for a block: output and errors are its `stdout`; if the block is left early, it is ended.
 
-    A session of its own keeps Ctrl-C from the child, so that we end it in an orderly way.
+    A session of its own keeps Ctrl-C from the child, so that we end it in an orderly way. So do we when we are told to
+    end (SIGTERM): a training that nobody waits for would go on, and write.
     """
+    with _ending_by_exception(), _running(command, env) as process:
+        yield process
+
+
+@contextmanager
+def _ending_by_exception() -> Iterator[None]:
+    """SIGTERM raises SystemExit, so that blocks are left in order; signals reach the main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _running(command: Sequence[str], env: Mapping[str, str] | None) -> "Iterator[subprocess.Popen[str]]":
     process = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,

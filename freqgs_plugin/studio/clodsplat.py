@@ -108,12 +108,17 @@ class ClodSplatModel(FreqSplatModel):
         config = self.config
         if not 1 <= config.largest_scale < float("inf"):
             raise ValueError(f"largest_scale is {config.largest_scale}; it must be a finite number >= 1.")
-        if not config.initial_decay > 0:
-            raise ValueError(f"initial_decay is {config.initial_decay}; it must be > 0, or nothing is ever drawn.")
-        if not config.least_decay > 0:
-            raise ValueError(f"least_decay is {config.least_decay}; it must be > 0.")
-        if any(not scale > 0 for scale in config.detail_scales):
-            raise ValueError(f"detail_scales are {config.detail_scales}; each must be > 0.")
+        for name in ("initial_decay", "least_decay", "reg_temperature"):
+            if not 0 < getattr(config, name) < float("inf"):
+                raise ValueError(f"{name} is {getattr(config, name)}; it must be a finite number > 0.")
+        for name in ("reg_weight", "export_distance"):
+            if not 0 <= getattr(config, name) < float("inf"):
+                raise ValueError(f"{name} is {getattr(config, name)}; it must be a finite number >= 0.")
+        for name in ("decay_start_step", "full_detail_every"):
+            if getattr(config, name) < 0:
+                raise ValueError(f"{name} is {getattr(config, name)}; it must be a number of steps >= 0.")
+        if any(not 0 < scale < float("inf") for scale in config.detail_scales):
+            raise ValueError(f"detail_scales are {config.detail_scales}; each must be a finite number > 0.")
 
     def populate_modules(self) -> None:
         super().populate_modules()

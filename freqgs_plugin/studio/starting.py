@@ -9,6 +9,7 @@ import yaml
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from freqgs_plugin.io.init_source import InitSource, frame_of, read_init_source
+from freqgs_plugin.io.ply import SplatFileError
 from freqgs_plugin.studio.viewing import psnr, show
 
 _VIEWS = 3
@@ -30,12 +31,19 @@ def run_facts(path: Path) -> RunFacts:
     """Read the config.yml of the run at `path` (its folder, that file, or a checkpoint) without building its objects.
 
     nerfstudio's own loader makes Python objects of whatever the file names.
+
+    Raises:
+        SplatFileError: the config.yml is damaged.
     """
     folders = [path, path.parent, path.parent.parent]
     config = next((folder / "config.yml" for folder in folders if (folder / "config.yml").is_file()), None)
     if config is None:
         return RunFacts()
-    node = yaml.compose(config.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    try:
+        node = yaml.compose(config.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise SplatFileError(f"{config} is damaged ({reason}); copy it again, or move it away.") from error
     signed = _scalar(node, "pipeline", "model", "signed_residuals")
     mode = _scalar(node, "pipeline", "model", "rasterize_mode")
     return RunFacts(
@@ -104,6 +112,9 @@ def _doubts(source: InitSource, config: Any) -> list[str]:
         doubts.append(f"Its harmonics of degree {raw.sh_degree} are cut off at sh-degree {config.sh_degree}.")
     if raw.decay is not None and not config.use_decay:
         doubts.append("Its decays are left out, because use-decay is off: everything is as opaque as near the camera.")
+    if raw.decay is not None and config.use_decay and (dead := int((raw.decay <= 0).sum())):
+        then = f"they begin at {config.least_decay:g}" if config.dead_decay == "keep" else "they are pruned"
+        doubts.append(f"{dead:,} of its {len(raw):,} decays are dead (0 or less), and would never be drawn: {then}.")
     return doubts
 
 

@@ -2,6 +2,7 @@ import dataclasses
 import math
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from freqgs_plugin.functional.attenuation import (
     LevelCut,
     Product,
     SingleLevel,
+    decay_of,
     frustum_distance,
     log_attenuated,
     normalised_distance,
@@ -279,3 +281,17 @@ class TestReferences:
         # in a process of its own, without the type checks that would come first
         said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
         assert "reference is 'near'; choose frustum_max, frustum_quantile or scene" in said
+
+
+def test_a_view_matrix_without_an_inverse_is_named():
+    with pytest.raises(ValueError, match="viewmat has no inverse"):
+        DistanceDecay(1.0, "scene", 2.0)(replace_decay(), Camera(torch.zeros(4, 4), torch.eye(3), 4, 4))
+
+
+def test_a_decay_that_is_not_everyones_is_named():
+    with pytest.raises(ValueError, match=r"decay has the shape \[1\], and opacities \[7\]"):
+        decay_of.__wrapped__(SimpleNamespace(decay=torch.ones(1), opacities=torch.ones(7)))
+
+
+def replace_decay():
+    return dataclasses.replace(gaussians(), decay=torch.ones(len(LEVELS)))

@@ -331,6 +331,29 @@ def test_a_tie_does_not_break_an_attenuations_budget():
     assert int((DecayBudget(4, "frustum_max")(same, CAMERA) > 0).sum()) == 4
 
 
+@pytest.mark.parametrize("soft", [True, False])
+@pytest.mark.parametrize("spread", [0.0, 1e-7, 1e-4])
+def test_equal_ones_fill_a_budget_as_well(soft, spread):
+    """Splats of one size and opacity on a plane that faces the camera; pairs of one place."""
+    plane = gaussians(100)
+    means = torch.stack([torch.linspace(-0.5, 0.5, 100), torch.zeros(100), torch.full((100,), 3.0)], -1)
+    same = {
+        "scales": torch.full((100, 3), 0.05),
+        "opacities": 0.5 + spread * torch.rand(100),
+        "decay": torch.full((100,), 4.0),
+    }
+    plane = replace(plane, means=means, **same)
+    twins = replace(
+        plane, means=means[::2].repeat_interleave(2, 0), opacities=plane.opacities[::2].repeat_interleave(2)
+    )
+    for scene in (plane, twins):
+        for count in (1, 10, 50, 99):
+            for at in (LevelBudget(count, soft), DecayBudget(count, "frustum_max", soft=soft, largest=5.0)):
+                weight = at(scene, CAMERA)
+                assert 0.75 * count <= int((weight > 0).sum()) <= count
+                assert weight.sum() > 0.4 * count * weight.max() and weight.max() > 0.1
+
+
 def in_view_by_level(scene):
     return torch.bincount(scene.level[in_view(scene, CAMERA)])[1:].tolist()
 

@@ -333,6 +333,15 @@ def test_other_shapes(tmp_path, name, shape):
     refused(f"{name} has shape .* in place of", tmp_path)
 
 
+def test_contents_that_are_no_tensors(tmp_path):
+    pipeline = state(gaussians())
+    refused("level is no tensor but 'x'", save(tmp_path / "a", {**pipeline, "_model.level": "x"}))
+    path = save(tmp_path / "b", pipeline)
+    torch.save({"step": "many", "pipeline": pipeline}, path)
+    refused("its step is 'many'", path)
+    assert len(read_init_source(save(tmp_path / "c", {**pipeline, 7: torch.zeros(1)})).gaussians) == 15
+
+
 def test_no_gaussians(tmp_path):
     save(tmp_path, {k: v[:0] for k, v in state(gaussians()).items()})
     refused("holds no Gaussians; name another checkpoint", tmp_path)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from importlib.metadata import EntryPoint
+from types import SimpleNamespace
 
 import pytest
 import scenes
@@ -82,12 +83,47 @@ def test_finite_numbers_whose_sum_overflows_pass():
     base.check_inputs(splats, scenes.camera())
 
 
+@pytest.mark.parametrize(
+    "name, shape, message",
+    [
+        ("opacities", lambda x: x[:5], r"opacities have the shape \[5\]; with 40 means it must be \[40\]"),
+        ("opacities", lambda x: x[:1], r"opacities have the shape \[1\]"),
+        ("opacities", lambda x: x[:, None], r"opacities have the shape \[40, 1\]"),
+        ("quats", lambda x: x[:, :3], r"quats have the shape \[40, 3\]; with 40 means it must be \[40, 4\]"),
+        ("scales", lambda x: x[:, :1], r"scales have the shape \[40, 1\]"),
+        ("means", lambda x: x[:, :2], r"means have the shape \[40, 2\]"),
+        ("features", lambda x: x[:7], r"features have the shape \[7, 3\]; with 40 means it must be \[40, d\]"),
+        ("features", lambda x: x[:, 0], r"features have the shape \[40\]"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_named(name, shape, message):
+    splats, camera = scenes.splats(dtype=torch.float32), scenes.camera(dtype=torch.float32)
+    fields = {leaf: getattr(splats, leaf) for leaf in scenes.LEAVES}
+    # as a user's program would: without the checks that only tests run with
+    wrong = SimpleNamespace(**{**fields, name: shape(fields[name])})
+    with pytest.raises(ValueError, match=message):
+        base._check_shapes.__wrapped__(wrong, camera)
+
+
+@pytest.mark.parametrize("change, error, message", [
+    ({"viewmat": torch.eye(3)}, ValueError, r"viewmat has the shape \[3, 3\], not \[4, 4\]"),
+    ({"K": torch.eye(4)}, ValueError, r"K has the shape \[4, 4\], not \[3, 3\]"),
+    ({"width": 4.5}, TypeError, "width is 4.5; it must be a whole number"),
+])  # fmt: skip
+def test_cameras_of_other_shapes_are_named(change, error, message):
+    camera = scenes.camera()
+    fields = {name: getattr(camera, name) for name in ("viewmat", "K", "width", "height")}
+    with pytest.raises(error, match=message):
+        base._check_shapes.__wrapped__(scenes.splats(), SimpleNamespace(**{**fields, **change}))
+
+
 @pytest.mark.parametrize("change, message", [
     ({"width": 0}, "camera is 0x29 px; both sides"),
     ({"K": torch.diag(torch.tensor([0.0, 1.0, 1.0]))}, "focal lengths are 0 and 1 px; both must be > 0"),
     ({"K": torch.diag(torch.tensor([-2.0, 1.0, 1.0]))}, "focal lengths are -2 and 1 px"),
     ({"K": torch.full((3, 3), float("nan"))}, "the camera's K is not finite"),
     ({"viewmat": torch.full((4, 4), float("inf"))}, "the camera's viewmat is not finite"),
+    ({"viewmat": torch.zeros(4, 4)}, "the camera's viewmat has no inverse"),
 ])  # fmt: skip
 @pytest.mark.parametrize("backend", ["torch", "numba"])
 def test_impossible_cameras_are_refused(backend, change, message):

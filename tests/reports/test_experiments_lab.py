@@ -2,6 +2,8 @@
 
 import io
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from freqgs_plugin.reports.experiments import runner
 from freqgs_plugin.reports.experiments.lab import Missing
 from freqgs_plugin.reports.experiments.options import ClodOptions, ExperimentError
 from freqgs_plugin.reports.experiments.runner import run_clod
-from freqgs_plugin.reports.experiments.store import Store, key
+from freqgs_plugin.reports.experiments.store import Store, alone, key
 from freqgs_plugin.reports.experiments.training import Trial
 
 TRIAL = Trial(SCENE, 30, 42)
@@ -224,3 +226,37 @@ def test_a_page_of_what_is_there_trains_nothing(tmp_path):
     assert "Of seed 42 alone." in page and "--page-only" not in page
     with pytest.raises(ExperimentError, match="holds no finished section"):
         run(options_in(tmp_path, steps=77, page_only=True))
+
+
+def test_two_at_once_are_refused(tmp_path):
+    options = options_in(tmp_path, only=("sigma",))
+    options.output_dir.mkdir()
+    with alone(options.output_dir), pytest.raises(ExperimentError, match=r"another .* works in .*another --output-dir"):
+        run(options)
+    run(options)
+    run(options_in(tmp_path, page_only=True))
+
+
+@pytest.mark.parametrize("content", ["null", "[]", '{"settings": {}}', '{"settings": {}, "result": null}'])
+def test_steps_that_hold_no_result_are_named(tmp_path, content):
+    store = Store(tmp_path)
+    store.path("curve", {}).write_text(content)
+    with pytest.raises(ExperimentError, match=r"is damaged .*remove it"):
+        store.read("curve", {})
+
+
+def test_a_child_ends_with_its_parent(tmp_path):
+    """SIGTERM, as from `timeout` or a batch system."""
+    code = (
+        "import sys\nfrom freqgs_plugin.reports.child import child\n"
+        "sleep = 'import time, os; print(os.getpid(), flush=True); time.sleep(60)'\n"
+        "with child([sys.executable, '-c', sleep]) as process:\n"
+        "    print(process.stdout.readline(), flush=True)\n    process.stdout.readline()\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    parent.terminate()
+    assert parent.wait(30) == 143
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)

@@ -150,6 +150,15 @@ def test_command_writes_json_and_page(few, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == [runner.JSON, runner.PAGE]
 
 
+@pytest.mark.parametrize("content", ["{", "{}", "[]", '{"groups": 3}'])
+def test_a_damaged_file_is_named_before_the_work(few, tmp_path, monkeypatch, content):
+    (tmp_path / runner.JSON).write_text(content)
+    monkeypatch.setattr(runner, "cases_of", lambda *_: 1 / 0)
+    with pytest.raises(runner.StabilityError, match=f"{runner.JSON} is damaged .*move it away"):
+        runner.run_stability(tmp_path, None, True, console())
+    assert (tmp_path / runner.JSON).read_text() == content
+
+
 def test_one_group_leaves_the_others_as_they_are(few, tmp_path):
     runner.run_stability(tmp_path, None, True, console())
     before = json.loads((tmp_path / runner.JSON).read_text())["groups"]

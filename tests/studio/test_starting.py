@@ -43,6 +43,13 @@ def test_a_runs_config_is_read_without_making_its_objects(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_damaged_config_is_named(tmp_path):
+    for content in (b"pipeline: [1, 2", b"\xff\xfe\x00broken"):
+        (tmp_path / "config.yml").write_bytes(content)
+        with pytest.raises(SplatFileError, match=r"config.yml is damaged .*copy it again"):
+            run_facts(tmp_path)
+
+
 def test_a_real_run_of_several_levels_is_refused(trained):
     with pytest.raises(SplatFileError, match="whose colours above level 1 are signed residuals: w"):
         read_start(trained)

@@ -4,6 +4,7 @@ import io
 import json
 import os
 import shlex
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.console import Console
 
+_PROBE = 1 << 20
+"""bytes: more than all that a report takes"""
 IMAGES = "images"
 """folder beside a documentation page that holds its pictures"""
 
@@ -68,6 +71,7 @@ def run_bench(bench: Bench, options: BenchOptions, console: "Console", *argument
     if options.docs is not None:
         page = options.docs.read_text(encoding="utf-8") if options.docs.is_file() else ""
         check_places(page, bench.tables, options.docs)
+    check_folder(options.output_dir)
     load = _load()
     with use_threads(options.threads):
         start = time.perf_counter()
@@ -158,6 +162,24 @@ def png(figure: "Figure") -> bytes:
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()
+
+
+def check_folder(folder: Path) -> None:
+    """Write something there, and leave no trace: what is impossible is better known before hours of work.
+
+    Raises:
+        OSError: names the folder.
+    """
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(bytes(_PROBE))
+            probe.flush()
+    except OSError as error:
+        raise OSError(error.errno, f"nothing can be written there ({error.strerror})", str(folder)) from error
+    for path in missing:
+        path.rmdir()
 
 
 def write_all(files: dict[Path, bytes]) -> None:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from freqgs_plugin.reports.bench.runner import IMAGES, png, write_all
+from freqgs_plugin.reports.bench.runner import IMAGES, check_folder, png, write_all
 from freqgs_plugin.reports.experiments import ablation, budget, curve, pops, sigma
 from freqgs_plugin.reports.experiments.goals import goal_table
 from freqgs_plugin.reports.experiments.lab import Lab, Missing, Tools
@@ -14,7 +14,7 @@ from freqgs_plugin.reports.experiments.options import SECTIONS, ClodOptions, Exp
 from freqgs_plugin.reports.experiments.page import Shown, markdown_page
 from freqgs_plugin.reports.experiments.progress import Bars, Silent
 from freqgs_plugin.reports.experiments.section import Part
-from freqgs_plugin.reports.experiments.store import Store
+from freqgs_plugin.reports.experiments.store import Store, alone
 from freqgs_plugin.reports.experiments.training import ExperimentScene, Trial
 from freqgs_plugin.reports.tables import finite_json
 from freqgs_plugin.reports.timing import environment
@@ -33,13 +33,16 @@ def run_clod(options: ClodOptions, scenes: Sequence[ExperimentScene], tools: Too
         KeyboardInterrupt: passed on, after a message on how to go on.
     """
     out = options.output_dir
+    for folder in (out, *([options.docs.parent] if options.docs is not None else [])):
+        check_folder(folder)
     out.mkdir(parents=True, exist_ok=True)
     store, log = Store(out / "steps"), out / "load.log"
     if options.page_only:
         shown, files = _report(options, scenes, Lab(store, tools, Silent(), log, only_finished=True))
     else:
         try:
-            shown, files = _measure(options, scenes, store, tools, log, console)
+            with alone(out):
+                shown, files = _measure(options, scenes, store, tools, log, console)
         except KeyboardInterrupt:
             _say(console, f"Stopped. What is finished is kept in {store.folder}; the same command goes on from there.")
             raise

@@ -2,9 +2,13 @@
 
 import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from freqgs_plugin.reports.bench.runner import write_all
 from freqgs_plugin.reports.experiments.options import ExperimentError
@@ -33,6 +37,8 @@ class Store:
             return None
         try:
             record = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(record, dict) or ("settings" in record and record.get("result") is None):
+                raise ValueError("no finished step")
         except ValueError as error:
             raise ExperimentError(f"{path} is damaged ({error}); remove it, and the step is done again") from error
         return record if record.get("settings") == _as_json(settings) else None
@@ -43,6 +49,26 @@ class Store:
         text = json.dumps(finite_json(record), indent=1, allow_nan=False)
         write_all({self.path(name, settings): text.encode() + b"\n"})
         return json.loads(text)
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """No other process works in `folder` meanwhile.
+
+    Raises:
+        ExperimentError: one does.
+    """
+    lock = FileLock(folder / "running.lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise ExperimentError(
+            f"another `freqgs experiment` works in {folder}; wait until it ends, or choose another --output-dir"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def key(settings: dict[str, Any]) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from freqgs_plugin.reports.bench.runner import check_folder
 from freqgs_plugin.reports.stability.case import Case, Group, Refused, Row, Setting, StabilityError
 from freqgs_plugin.reports.stability.cases_training import TrainingCase, run_training
 from freqgs_plugin.reports.stability.measure import Evaluated, measure, truths
@@ -32,7 +33,9 @@ def run_stability(output_dir: Path, only: Group | None, quick: bool, console: "C
         StabilityError: some outcome was not the expected one.
         KeyboardInterrupt: passed on, after a message on what is saved.
     """
+    check_folder(output_dir)
     output_dir.mkdir(parents=True, exist_ok=True)
+    saved_groups(output_dir)
     rows_path = output_dir / ROWS
     rows_path.unlink(missing_ok=True)
     failed: list[Row] = []
@@ -55,10 +58,24 @@ def run_stability(output_dir: Path, only: Group | None, quick: bool, console: "C
         raise StabilityError(f"{len(failed)} outcomes are not the expected ones: {names}")
 
 
+def saved_groups(output_dir: Path) -> dict[str, Any]:
+    """The groups in the JSON file; none where there is no file.
+
+    Raises:
+        StabilityError: it is damaged.
+    """
+    path = output_dir / JSON
+    if not path.is_file():
+        return {}
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8"))["groups"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise StabilityError(f"{path} is damaged ({error!r}); move it away, or choose another --output-dir") from error
+
+
 def save_group(output_dir: Path, group: Group, record: dict[str, Any]) -> None:
     """Put a finished group into the JSON file and write the page anew, each in one step."""
-    path = output_dir / JSON
-    groups = json.loads(path.read_text(encoding="utf-8"))["groups"] if path.is_file() else {}
+    path, groups = output_dir / JSON, saved_groups(output_dir)
     groups[group] = finite_json(record)
     groups = {name: groups[name] for name in GROUPS if name in groups}
     text, page = json.dumps({"groups": groups}, indent=1, allow_nan=False) + "\n", markdown_page(groups)
