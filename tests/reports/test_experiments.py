@@ -187,6 +187,7 @@ def test_spread_over_seeds():
     found = spread(rows, lambda row: row["x"])
     assert found is not None and found.mean == 2.5 and found.half_range == 1.75
     assert shown(rows, lambda row: row["x"], ".1f") == "2.5 ± 1.8"
+    assert shown(rows, lambda row: row["x"], "+.1f") == "+2.5 ± 1.8", "half a range has no sign"
     assert shown(rows[:1], lambda row: row["x"], ".1f") == "1.0"
     assert shown([{"x": None}, {"x": 1.0}], lambda row: row["x"]) == "-", "an infinite one has no mean"
     assert math.isnan(mean([{"x": None}], lambda row: row["x"]))

@@ -19,7 +19,7 @@ class Spread:
         """Mean and, of more than one seed, half of the range behind ±."""
         if self.count == 1:
             return f"{self.mean:{form}}"
-        return f"{self.mean:{form}} ± {self.half_range:{form}}"
+        return f"{self.mean:{form}} ± {self.half_range:{form.lstrip('+')}}"
 
 
 def spread(results: Sequence[Any], figure: Callable[[Any], float | int | None]) -> Spread | None:
