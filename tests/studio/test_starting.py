@@ -1,6 +1,7 @@
 """Training that starts from an exported scene or from another run."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from freqgs_plugin.functional.budget import in_view
 from freqgs_plugin.io.init_source import TRANSFORMS, frame_of, read_frame, read_init_source
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.ply import SplatFileError, write_ply
+from freqgs_plugin.studio import starting
 from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.starting import RunFacts, read_start, run_facts
 
@@ -48,6 +50,24 @@ def test_a_damaged_config_is_named(tmp_path):
         (tmp_path / "config.yml").write_bytes(content)
         with pytest.raises(SplatFileError, match=r"config.yml is damaged .*copy it again"):
             run_facts(tmp_path)
+
+
+@pytest.mark.parametrize("dead_decay, then", [("keep", "they begin at 0.3"), ("prune", "they are pruned")])
+def test_dead_decays_are_told(dead_decay, then):
+    raw = SimpleNamespace(sh_degree=0, decay=torch.tensor([-1.0, 0.0, 2.0]))
+    config = SimpleNamespace(
+        sh_degree=3, use_decay=True, least_decay=0.3, dead_decay=dead_decay, rasterize_mode="antialiased"
+    )
+    source = SimpleNamespace(antialiased=None, gaussians=Three(**vars(raw)))
+    (doubt,) = starting._doubts.__wrapped__(source, config)
+    assert doubt.startswith("2 of its 3 decays are dead (0 or less)") and doubt.endswith(f"{then}.")
+
+
+class Three(SimpleNamespace):
+    """Something of three Gaussians."""
+
+    def __len__(self):
+        return 3
 
 
 def test_a_real_run_of_several_levels_is_refused(trained):
