@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from freqgs_plugin.functional.projection import NEAR_PLANE, rotation_rows
+from freqgs_plugin.functional.projection import NEAR_PLANE, exact_centre, rotation_rows
 from freqgs_plugin.types import Camera, Gaussians
 
 _OPAQUE = 0.5
@@ -75,8 +75,10 @@ class GeometryIndex:
         slope_x = (pixel[0] - intrinsics[0, 2]) / intrinsics[0, 0]
         slope_y = (pixel[1] - intrinsics[1, 2]) / intrinsics[1, 1]
         # camera z is 1 per unit of the ray, so that its parameter is the depth
-        direction = viewmat[:3, :3].T @ torch.stack([slope_x, slope_y, torch.ones_like(slope_x)])
-        centre = torch.linalg.solve(viewmat[:3, :3], -viewmat[:3, 3])
+        ray = torch.stack([slope_x, slope_y, torch.ones_like(slope_x)])
+        centre = exact_centre(camera).to(means)
+        # solved for, not turned back: a rotation rounded to float32 is not quite one
+        direction = torch.linalg.solve(viewmat[:3, :3], ray)
         rotation = torch.stack([torch.stack(row, -1) for row in rotation_rows(g.quats.double())], -2)
         scales = g.scales.double().clamp_min(_LEAST_SIZE)
         # into each Gaussian's own axes, in standard deviations

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from freqgs_plugin.functional.projection import NEAR_PLANE
+from freqgs_plugin.functional.projection import NEAR_PLANE, exact_centre
 from freqgs_plugin.types import Camera, Gaussians
 
 TAU = 1.0 / 255.0
@@ -187,28 +187,13 @@ def frustum_distance(
 def _offsets(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "3 n"]:
     """From the camera's centre to each mean, on the world's axes."""
     means = _at_least_float32(gaussians.means)
-    centre = _exact_centre(camera)
+    centre = exact_centre(camera)
     # from a rounded centre, so that scenes far from the origin keep their digits; then what rounding took from it
     rounded = centre.to(means)
     rest = rounded.to(centre) - centre
     # axes first: what follows reads one axis at a time
     offsets = means.new_empty(3, len(means))
     return torch.sub(means.T, rounded[:, None], out=offsets).add_(rest.to(means)[:, None])
-
-
-def _exact_centre(camera: Camera) -> Float[Tensor, " 3"]:
-    """Where the view matrix takes to 0, in float64 on the CPU.
-
-    -R^T t is that only as far as the rotation, rounded to float32, is orthonormal: 1e6 units away it is wrong by 0.1.
-
-    Raises:
-        ValueError: there is no such place, as the matrix is singular.
-    """
-    exact = camera.viewmat[:3].to("cpu", torch.float64)
-    try:
-        return torch.linalg.solve(exact[:, :3], -exact[:, 3])
-    except torch.linalg.LinAlgError as error:
-        raise ValueError(f"the camera's viewmat has no inverse: {exact.tolist()}. Check the camera's pose.") from error
 
 
 def _lengths(offsets: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:

@@ -54,14 +54,28 @@ def test_a_ray_hits_what_is_in_front_at_its_depth():
     assert GeometryIndex(far).pick(view, (-400.0, 10.0)) is None
 
 
-def test_picked_depths_are_those_of_the_picture():
-    g, view = one((0.0, 0.0, 4.0), scales=(2.0, 2.0, 0.05), opacity=1.0), camera(angles=(0.1, -0.1, 0.3))
-    depth = render(g, view, rasterizer=get_rasterizer("torch", "cpu"), antialiased=False).depth[..., 0]
-    index = GeometryIndex(g)
-    for x, y in ((18, 14), (12, 10), (25, 19)):
-        hit = index.pick(view, (x + 0.5, y + 0.5))
-        # a flat disc: the picture has the depth of its centre, the pick that of the ray's own crossing
-        assert hit is not None and hit.depth == pytest.approx(float(depth[y, x]), rel=0.15)
+def test_a_ray_hits_a_flat_disc_where_it_crosses_its_plane():
+    """A disc in the plane z = 4 of the world, seen at a slant."""
+    index, view = (
+        GeometryIndex(one((0.0, 0.0, 4.0), scales=(2.0, 2.0, 1e-7), opacity=1.0)),
+        camera(angles=(0.1, -0.1, 0.3)),
+    )
+    for x, y in ((18.5, 14.5), (12.5, 10.5), (25.5, 19.5)):
+        hit = index.pick(view, (x, y))
+        assert hit is not None and float(hit.point[2]) == pytest.approx(4.0, abs=1e-9)
+        seen = view.viewmat[:3, :3] @ hit.point + view.viewmat[:3, 3]
+        assert float(seen[2]) == pytest.approx(hit.depth, abs=1e-9)
+        pixel = view.K @ seen / seen[2]
+        assert pixel[:2].tolist() == pytest.approx([x, y], abs=1e-6)
+
+
+def test_a_picked_depth_is_that_of_the_picture():
+    """Straight ahead at a disc that faces the camera: the picture's depth is its centre's, which the ray meets."""
+    view = camera()
+    g = one((-view.viewmat[:3, 3] + torch.tensor([0.0, 0.0, 4.0])).tolist(), scales=(2.0, 2.0, 0.05), opacity=1.0)
+    depth = render(g, view, rasterizer=get_rasterizer("torch", "cpu"), antialiased=False).depth[14, 18, 0]
+    hit = GeometryIndex(g).pick(view, (18.5, 14.5))
+    assert hit is not None and hit.depth == pytest.approx(float(depth), rel=1e-6)
 
 
 def test_what_lies_behind_the_camera_is_not_hit():
@@ -83,5 +97,7 @@ def test_bad_input_is_named():
     broken = dataclasses.replace(g, means=g.means.index_fill(0, torch.tensor([0]), torch.nan))
     with pytest.raises(ValueError, match="1 centres are not finite"):
         GeometryIndex(broken)
+    with pytest.raises(ValueError, match="viewmat has no inverse"):
+        GeometryIndex(g).pick(dataclasses.replace(camera(), viewmat=torch.zeros(4, 4, dtype=torch.float64)), (1.0, 1.0))
     with pytest.raises(ValueError, match="points hold NaN"):
         GeometryIndex(g).nearest(torch.full((1, 3), torch.nan, dtype=torch.float64))
