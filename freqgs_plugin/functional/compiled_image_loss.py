@@ -17,6 +17,8 @@ _BLOCK = 4
 _CHUNK = 32
 """rows that go through all steps together: the blurred maps of so many and `_REACH` stay in the second-level cache"""
 _DEEP = _CHUNK + _REACH
+_SAMPLED_ROWS = 32
+"""rows that a plane's mean is estimated from, at least, where it has so many: any number near it does"""
 _LEAD = 12
 """rows that a strip computes again above itself: at least `_REACH`, a multiple of `_BLOCK`"""
 
@@ -30,8 +32,8 @@ class CompiledImageSums(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, x, y, rows, columns, pixels, by_ssim, by_l1):
-        weights = by_ssim, by_l1
-        value, gradient = image_sums(x.detach(), y.detach(), rows, columns, pixels, *weights, ctx.needs_input_grad[0])
+        gradient = torch.empty_like(x if ctx.needs_input_grad[0] else x[:0])
+        value = image_sums(x.detach(), y.detach(), rows, columns, pixels, by_ssim, by_l1, gradient)
         ctx.save_for_backward(gradient)
         return x.new_tensor(value)
 
@@ -43,38 +45,62 @@ class CompiledImageSums(torch.autograd.Function):
 
 def image_sums(
     x: Tensor, y: Tensor, rows: np.ndarray, columns: np.ndarray, pixels: int, by_ssim: float, by_l1: float,
-    wants_gradient: bool,
-) -> tuple[float, Tensor]:  # fmt: skip
-    """Value of `CompiledImageSums`, and its gradient for x (empty where it is not wanted)."""
+    gradient: Tensor,
+) -> float:  # fmt: skip
+    """Value of `CompiledImageSums`; its gradient for x is written into `gradient`, `[p h w]` or without elements."""
     planes, height, _ = x.shape
     pair, scalar = (x.numpy(), y.numpy()), x.numpy().dtype.type
     taps = tuple(rows[:6].astype(scalar)), tuple(columns[:6].astype(scalar))
-    # a plane's mean is subtracted before SSIM: variances of bright flat ones are differences of large squares
-    totals, sums = np.empty((2, planes, height)), np.zeros((2, planes, height))
-    _row_sums(*pair, totals)
-    gradient = torch.empty_like(x if wants_gradient else x[:0])
+    # about a plane's mean is subtracted before SSIM: variances of bright flat ones are differences of large squares
+    step = max(1, height // _SAMPLED_ROWS)
+    totals, sums = np.empty((2, planes, -(-height // step))), np.zeros((2, planes, height))
+    _row_sums(*pair, step, totals)
     # two strips per thread, each a multiple of the block: where they end changes no bits
     strips = 1 if get_num_threads() == 1 else max(1, -(-2 * get_num_threads() // planes))
     strip = max(_CHUNK, -(-height // (strips * _BLOCK)) * _BLOCK)
     _compare(
         *pair,
         *taps,
-        (totals.sum(2) / pixels).astype(scalar),
+        (totals.sum(2) * (height / totals.shape[2] / pixels)).astype(scalar),
         scalar(by_ssim),
         scalar(by_l1),
         strip,
         sums,
         gradient.numpy(),
     )
-    return by_ssim * sums[0].sum() + by_l1 * sums[1].sum(), gradient
+    return by_ssim * sums[0].sum() + by_l1 * sums[1].sum()
 
 
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)
-def _row_sums(x, y, sums):
-    planes, height, _ = x.shape
+def _row_sums(x, y, step, sums):
+    """Of every `step`-th row."""
+    planes, rows = sums.shape[1:]
+    for task in prange(planes * rows):
+        p, i = task // rows, task % rows
+        sums[0, p, i], sums[1, p, i] = row_sum(x[p, i * step]), row_sum(y[p, i * step])
+
+
+def squared_error_as_shown(x: Tensor, y: Tensor) -> float:
+    """Sum of (clamp(x, 0, 1) - y)^2 over planes [p h w]."""
+    sums = np.empty(x.shape[:2])
+    _squared_errors(x.numpy(), y.numpy(), sums)
+    return float(sums.sum())
+
+
+@njit(parallel=True, error_model="numpy", cache=True, nogil=True)
+def _squared_errors(x, y, sums):
+    planes, height, width = x.shape
+    zero, one = x.dtype.type(0), x.dtype.type(1)
     for task in prange(planes * height):
-        p, row = task // height, task % height
-        sums[0, p, row], sums[1, p, row] = row_sum(x[p, row]), row_sum(y[p, row])
+        a, b = x[task // height, task % height], y[task // height, task % height]
+        line = np.empty(width, x.dtype)
+        for j in range(width):
+            value = a[j]
+            # comparisons that keep NaN
+            value = zero if value < zero else value
+            value = one if value > one else value
+            line[j] = (value - b[j]) * (value - b[j])
+        sums[task // height, task % height] = row_sum(line)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

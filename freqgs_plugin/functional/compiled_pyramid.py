@@ -14,18 +14,28 @@ class CompiledReduce(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image: Tensor) -> Tensor:
         ctx.shape = image.shape
-        height, width = image.shape[-2:]
-        out = image.new_empty(*image.shape[:-2], (height + 1) // 2, (width + 1) // 2)
-        _reduce(image.detach().reshape(-1, height, width).contiguous().numpy(), out.view(-1, *out.shape[-2:]).numpy())
-        return out
+        return halve(image.detach())
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream: Tensor) -> Tensor:
         gradient = upstream.new_zeros(ctx.shape)
-        small = upstream.reshape(-1, *upstream.shape[-2:]).contiguous()
-        _reduce_transposed(small.numpy(), gradient.view(-1, *ctx.shape[-2:]).numpy())
+        add_halving_gradient(upstream, gradient)
         return gradient
+
+
+def halve(image: Tensor) -> Tensor:
+    """One halving of images [b c h w]."""
+    height, width = image.shape[-2:]
+    out = image.new_empty(*image.shape[:-2], (height + 1) // 2, (width + 1) // 2)
+    _reduce(image.reshape(-1, height, width).contiguous().numpy(), out.view(-1, *out.shape[-2:]).numpy())
+    return out
+
+
+def add_halving_gradient(upstream: Tensor, gradient: Tensor) -> None:
+    """Add to `gradient` [b c h w] what `halve` passes back of `upstream` [b c h2 w2]."""
+    small = upstream.reshape(-1, *upstream.shape[-2:]).contiguous()
+    _reduce_transposed(small.numpy(), gradient.view(-1, *gradient.shape[-2:]).numpy())
 
 
 @njit(error_model="numpy", inline="always")
@@ -60,23 +70,33 @@ def _reduce(image, out):
 
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True, fastmath={"contract"})
 def _reduce_transposed(small, out):
-    """Add to `out` [planes, h, w] what each pixel of `small` was made of; planes run in parallel."""
+    """Add to `out` [planes, h, w] what each pixel of `small` was made of."""
     planes, height, width = out.shape
-    one, four, six, scale = out.dtype.type(1), out.dtype.type(4), out.dtype.type(6), out.dtype.type(1 / 256)
-    for p in prange(planes):
-        for y in range(small.shape[1]):
-            line = np.zeros(width + 4, out.dtype)
-            for x in range(small.shape[2]):
-                value = scale * small[p, y, x]
-                line[2 * x] += value
-                line[2 * x + 1] += four * value
-                line[2 * x + 2] += six * value
-                line[2 * x + 3] += four * value
-                line[2 * x + 4] += value
-            for x in (-2, -1, width, width + 1):
-                line[_mirrored(x, width) + 2] += line[x + 2]
+    rows, columns = small.shape[1:]
+    taps = (1.0, 4.0, 6.0, 4.0, 1.0)
+    zero, four, six, scale = out.dtype.type(0), out.dtype.type(4), out.dtype.type(6), out.dtype.type(1 / 256)
+    for task in prange(planes * height):
+        p, y = task // height, task % height
+        # down: the rows that this one went into, a zero on either side of them
+        line = np.zeros(columns + 2, out.dtype)
+        for i in range(max(0, y // 2 - 2), min(rows, y // 2 + 3)):
+            weight = 0.0
             for tap in range(5):
-                weight = (one, four, six, four, one)[tap]
-                row = out[p, _mirrored(2 * y + tap - 2, height)]
-                for x in range(width):
-                    row[x] += weight * line[x + 2]
+                if _mirrored(2 * i + tap - 2, height) == y:
+                    weight += taps[tap]
+            if weight != 0:
+                factor, source = scale * out.dtype.type(weight), small[p, i]
+                for x in range(columns):
+                    line[x + 1] += factor * source[x]
+        # along: even positions from three pixels, odd ones from two; then what lies beyond the edges is mirrored back
+        wide = np.empty(2 * columns + 4, out.dtype)
+        wide[0], wide[1] = line[1], four * line[1]
+        for x in range(columns):
+            wide[2 * x + 2] = six * line[x + 1] + line[x] + line[x + 2]
+            wide[2 * x + 3] = four * (line[x + 1] + line[x + 2])
+        wide[2 * columns + 2], wide[2 * columns + 3] = line[columns], zero
+        for x in (-2, -1, width, width + 1):
+            wide[_mirrored(x, width) + 2] += wide[x + 2]
+        row = out[p, y]
+        for x in range(width):
+            row[x] += wide[x + 2]

@@ -1,6 +1,6 @@
 """DFT magnitudes and their distance on the CPU, compiled: `spectrum` is the interface."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -13,40 +13,45 @@ from freqgs_plugin.functional.numba_threads import njit, prange
 
 def compiled_magnitude(image: Tensor, size: tuple[int, int]) -> Tensor:
     """|F| [..., u, v // 2 + 1]."""
-    image = image.detach()
-    planes = _planes([image])
+    planes = planes_of([image.detach()])
     out = image.new_empty(len(planes), size[0], size[1] // 2 + 1)
     for p, spectrum in enumerate(_paired_spectra(planes, size)):
         _magnitudes(spectrum.numpy(), out[2 * p : 2 * p + 2].numpy())
     return out.view(*image.shape[:-2], *out.shape[1:])
 
 
-class CompiledDistance(torch.autograd.Function):
-    """`weight` times the mean of | |F(x)| - T | on CPU over images x of one size, T of all of them in order.
+def distance(
+    planes: list[np.ndarray], target: Tensor, size: tuple[int, int], weight: float, gradients: list[np.ndarray]
+) -> float:
+    """`weight` times the mean of | |F(x)| - T | over `planes` x `[h w]` and their magnitudes T, `[planes u v2]`.
 
     Two planes at a time, so that they stay in the second-level cache: one complex transform of `size`, one compiled
-    pass over its bins and, where a gradient is wanted, the transform back.
+    pass over its bins and, unless `gradients` is empty, the transform back into these planes.
     """
+    height, width = size
+    magnitudes = target.detach().reshape(-1, height, width // 2 + 1).contiguous().numpy()
+    factor = weight / (len(planes) * height * width)
+    sums = np.zeros((len(planes) + 1) // 2 * height)
+    for p, spectrum in enumerate(_paired_spectra(planes, size)):
+        _compare(spectrum.numpy(), magnitudes[2 * p : 2 * p + 2], sums[p * height : (p + 1) * height])
+        if gradients:
+            pair = torch.view_as_real(torch.fft.ifft2(torch.view_as_complex(spectrum), norm="forward")).numpy()
+            _unpack(pair, pair.dtype.type(factor), gradients[2 * p], _partner(gradients, p))
+    return sums.sum() * factor
+
+
+class CompiledDistance(torch.autograd.Function):
+    """`distance` of images x of one size from T, which is of all of them in order."""
 
     @staticmethod
     def forward(ctx, target, size, weight, *images):
-        height, width = size
-        target = target.detach().to(images[0].dtype).reshape(-1, height, width // 2 + 1).contiguous()
-        planes = _planes([image.detach() for image in images])
         wanted = any(ctx.needs_input_grad[3:])
         gradients = [image.new_empty(image.shape if wanted else 0) for image in images]
-        parts = _planes(gradients) if wanted else []
-        scale, total = weight / (len(planes) * height * width), 0.0
-        for p, spectrum in enumerate(_paired_spectra(planes, size)):
-            sums = np.zeros(height)
-            _compare(spectrum.numpy(), target[2 * p : 2 * p + 2].numpy(), sums)
-            total += sums.sum()
-            if wanted:
-                pair = torch.view_as_real(torch.fft.ifft2(torch.view_as_complex(spectrum), norm="forward"))
-                factor = pair.numpy().dtype.type(scale)
-                _unpack(pair.numpy(), factor, parts[2 * p].numpy(), _partner(parts, p).numpy())
+        parts = planes_of(gradients) if wanted else []
+        planes = planes_of([image.detach() for image in images])
+        value = distance(planes, target.to(images[0].dtype), size, weight, parts)
         ctx.save_for_backward(*gradients)
-        return images[0].new_tensor(total * scale)
+        return images[0].new_tensor(value)
 
     @staticmethod
     @once_differentiable
@@ -54,22 +59,23 @@ class CompiledDistance(torch.autograd.Function):
         return None, None, None, *(scaled(gradient, upstream) for gradient in ctx.saved_tensors)
 
 
-def _planes(images: list[Tensor]) -> list[Tensor]:
-    """The planes `[h w]` of all images in order, contiguous."""
-    return [plane for image in images for plane in image.reshape(-1, *image.shape[-2:]).contiguous()]
+def planes_of(images: Sequence[Tensor]) -> list[np.ndarray]:
+    """The planes `[h w]` of all images in order; they share memory with images that are contiguous."""
+    return [plane for image in images for plane in image.reshape(-1, *image.shape[-2:]).contiguous().numpy()]
 
 
-def _partner(planes: list[Tensor], p: int) -> Tensor:
+def _partner(planes: list[np.ndarray], p: int) -> np.ndarray:
     """The second of pair p; of an odd number of planes the last one is its own."""
     return planes[min(2 * p + 1, len(planes) - 1)]
 
 
-def _paired_spectra(planes: list[Tensor], size: tuple[int, int]) -> Iterator[Tensor]:
+def _paired_spectra(planes: list[np.ndarray], size: tuple[int, int]) -> Iterator[Tensor]:
     """`[u v 2]` for each pair: the full DFT of plane 2p + i * plane 2p + 1, each with zeros up to `size`, as reals."""
-    pair = planes[0].new_empty(*size, 2)
+    packed = np.empty((*size, 2), planes[0].dtype)
+    pair = torch.view_as_complex(torch.from_numpy(packed))
     for p in range((len(planes) + 1) // 2):
-        _pack(planes[2 * p].numpy(), _partner(planes, p).numpy(), pair.numpy())
-        yield torch.view_as_real(torch.fft.fft2(torch.view_as_complex(pair)))
+        _pack(planes[2 * p], _partner(planes, p), packed)
+        yield torch.view_as_real(torch.fft.fft2(pair))
 
 
 @njit(parallel=True, error_model="numpy", cache=True, nogil=True)

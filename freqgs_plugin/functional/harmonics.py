@@ -68,23 +68,10 @@ def evaluate(
 
     `dc` is the coefficient of degree 0, `rest` are the (degree + 1)^2 - 1 others.
     """
-    degree = _degree(rest)
-    if degree == 0:
-        # adds 0, and gives a parameter that `rest` is a slice of its gradient, 0: optimizers count its steps from there
-        return C0 * dc + rest.sum(1)
-    if dc.device.type == "cpu" and dc.dtype == rest.dtype == offsets.dtype == torch.float32 and degree <= 3:
-        from freqgs_plugin.functional.compiled_harmonics import CompiledHarmonics
-
-        return CompiledHarmonics.apply(dc, rest, offsets)
-    return evaluate_in_torch(dc, rest, offsets)
-
-
-def evaluate_in_torch(
-    dc: Float[Tensor, "n 3"], rest: Float[Tensor, "n k 3"], offsets: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 3"]:
-    """`evaluate` on any device and in any dtype."""
     # squares of far offsets overflow in float32
     directions = torch.nn.functional.normalize(offsets.to(working_dtype(offsets)), dim=-1).to(offsets)
+    # of degree 0 the sum is 0, and gives a parameter that `rest` is a slice of its gradient, 0: optimizers count its
+    # steps from there
     return C0 * dc + (basis(directions, _degree(rest))[:, 1:, None] * rest).sum(1)
 
 
@@ -104,6 +91,22 @@ def level_colours(
     `dc`, `rest` and `offsets` as for `evaluate`. With `signed_residuals` False, Eq. 3 for every level. Eq. 4's range is
     [-1, inf): the paper names [-1, 1], its code does not clamp from above.
     """
+    on_cpu = dc.device.type == "cpu" and dc.dtype == rest.dtype == offsets.dtype == torch.float32
+    if on_cpu and not level.is_floating_point() and _degree(rest) <= 3:
+        from freqgs_plugin.functional.compiled_harmonics import CompiledColours
+
+        return CompiledColours.apply(dc, rest, offsets, level, signed_residuals)  # pyright: ignore[reportReturnType]
+    return level_colours_in_torch(dc, rest, offsets, level, signed_residuals)
+
+
+def level_colours_in_torch(
+    dc: Float[Tensor, "n 3"],
+    rest: Float[Tensor, "n k 3"],
+    offsets: Float[Tensor, "n 3"],
+    level: Int[Tensor, " n"],
+    signed_residuals: bool,
+) -> Float[Tensor, "n 3"]:
+    """`level_colours` on any device and in any dtype."""
     colour = torch.clamp_min(evaluate(dc, rest, offsets) + 0.5, 0.0)
     if not signed_residuals:
         return colour

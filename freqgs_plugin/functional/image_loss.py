@@ -55,7 +55,7 @@ def image_distance(
     if not _has_kernels(pred, target):
         similarity = _ssim_by_convolution(pred, target)
         return weight * ((1 - ssim_weight) * _mean_distance(pred, target) + ssim_weight * (1 - similarity))
-    by_l1, by_ssim = weight * (1 - ssim_weight) / pred.numel(), -weight * ssim_weight / _windows(pred)
+    by_l1, by_ssim = weight * (1 - ssim_weight) / pred.numel(), -weight * ssim_weight / windows(pred)
     return weight * ssim_weight + _compiled_sums(pred, target, by_ssim, by_l1)
 
 
@@ -71,7 +71,19 @@ def ssim(pred: Float[Tensor, "b c h w"], target: Float[Tensor, "b c h w"]) -> Fl
     pred, target = _comparable(pred, target)
     if not _has_kernels(pred, target):
         return _ssim_by_convolution(pred, target)
-    return _compiled_sums(pred, target, 1 / _windows(pred), 0.0)
+    return _compiled_sums(pred, target, 1 / windows(pred), 0.0)
+
+
+def mean_square_as_shown(picture: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
+    """Mean of (clamp(picture, 0, 1) - target)^2, without gradient."""
+    picture, target = picture.detach(), target.detach()
+    same = picture.dtype == target.dtype and picture.dtype in (torch.float32, torch.float64)
+    if picture.device.type == "cpu" and same and picture.shape == target.shape:
+        from freqgs_plugin.functional.compiled_image_loss import squared_error_as_shown
+
+        planes = (image.permute(2, 0, 1).contiguous() for image in (picture, target))
+        return picture.new_tensor(squared_error_as_shown(*planes) / max(picture.numel(), 1))
+    return (picture.clamp(0, 1) - target).square().mean()
 
 
 def _mean_distance(pred: Tensor, target: Tensor) -> Tensor:
@@ -92,10 +104,10 @@ def _has_kernels(pred: Tensor, target: Tensor) -> bool:
     return pred.device.type == "cpu" and not target.requires_grad
 
 
-def _windows(image: Tensor) -> int:
+def windows(image: Tensor) -> int:
     """How many windows SSIM is the mean over."""
     height, width = image.shape[-2:]
-    return image.shape[:-2].numel() * (height - _window(height).size + 1) * (width - _window(width).size + 1)
+    return image.shape[:-2].numel() * (height - window(height).size + 1) * (width - window(width).size + 1)
 
 
 def _compiled_sums(pred: Tensor, target: Tensor, by_ssim: float, by_l1: float) -> Tensor:
@@ -103,7 +115,7 @@ def _compiled_sums(pred: Tensor, target: Tensor, by_ssim: float, by_l1: float) -
     from freqgs_plugin.functional.compiled_image_loss import CompiledImageSums
 
     height, width = pred.shape[-2:]
-    rows, columns = _window(height), _window(width)
+    rows, columns = window(height), window(width)
     # a shorter window is an 11-tap one with zeros around it, over an image with as many zeros around it
     pixels = height * width
     edge = ((TAPS - columns.size) // 2,) * 2 + ((TAPS - rows.size) // 2,) * 2
@@ -123,7 +135,7 @@ def _plane_means(image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c 1 1"]:
 
 
 @lru_cache(maxsize=16)
-def _window(side: int) -> np.ndarray:
+def window(side: int) -> np.ndarray:
     """The normalised 1D Gaussian of the largest odd size up to 11 that fits into `side` pixels, float64."""
     size = min(TAPS, side - 1 + side % 2)
     taps = np.exp(-0.5 * ((np.arange(size) - size // 2) / _SIGMA) ** 2)
@@ -132,8 +144,8 @@ def _window(side: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _window_on(side: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`_window` as a tensor; kept, because a copy to a CUDA device waits for it."""
-    return torch.as_tensor(_window(side), dtype=dtype, device=device)
+    """`window` as a tensor; kept, because a copy to a CUDA device waits for it."""
+    return torch.as_tensor(window(side), dtype=dtype, device=device)
 
 
 def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:

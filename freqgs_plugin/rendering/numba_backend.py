@@ -119,7 +119,7 @@ class _Composite(torch.autograd.Function):
                 _array(v_alpha if v_alpha is not None and number == 0 else no_gradient), partial.numpy(),
             )  # fmt: skip
             widths = {"means": 3, "quats": 4, "scales": 3, "opacity": 1, "features": 3, "xy": 2, "abs": 2}
-            out = {name: torch.zeros(n, width) for name, width in widths.items()}
+            out = {name: torch.empty(n, width) for name, width in widths.items()}
             out["view"] = torch.zeros(n if wants_pose else 0, 12)
             project_backward(
                 _array(means), _array(quats), _array(scales), _array(opacities), view.pose, view.intrinsics,
@@ -141,6 +141,42 @@ class _Composite(torch.autograd.Function):
             total["means"], total["quats"], total["scales"], total["opacity"][:, 0], v_all[:, :d], total["xy"][None],
             v_pose, v_background, None, None, None, None,
         )  # fmt: skip
+
+
+class _Pictures(torch.autograd.Function):
+    """[prefixes, ...] -> its parts. Their gradients are not copied where they lie one behind the other already.
+
+    That of indexing one by one would be an image of zeros per prefix, that of `unbind` copies always.
+    """
+
+    @staticmethod
+    def forward(ctx, planes):
+        ctx.set_materialize_grads(False)
+        ctx.shape = planes.shape
+        return planes.unbind(0)
+
+    @staticmethod
+    def backward(ctx, *grads):
+        first = grads[0]
+        if first is None:
+            given = next((grad for grad in grads if grad is not None), None)
+            if given is None:
+                return None
+            first = torch.zeros_like(given)
+        if all(_follows(grad, first, k) for k, grad in enumerate(grads)):
+            return first.as_strided(ctx.shape, (first.numel(), *first.stride()))
+        return torch.stack([torch.zeros_like(first) if grad is None else grad for grad in grads])
+
+
+def _follows(part: Tensor | None, first: Tensor, k: int) -> bool:
+    """Whether `part` lies in memory as the k-th after `first`."""
+    return (
+        part is not None
+        and part.is_contiguous()
+        and part.dtype == first.dtype
+        and part.untyped_storage().data_ptr() == first.untyped_storage().data_ptr()
+        and part.data_ptr() == first.data_ptr() + k * first.numel() * first.element_size()
+    )
 
 
 class NumbaRasterizer:
@@ -192,8 +228,8 @@ class NumbaRasterizer:
     ) -> list[Rendering]:  # fmt: skip
         _check(splats, camera)
         n = len(splats)
-        projected, conics, depths = torch.zeros(n, COLUMNS), torch.zeros(n, 3), torch.zeros(n)
-        radii = torch.zeros(n, dtype=torch.int32)
+        projected, conics, depths = torch.empty(n, COLUMNS), torch.empty(n, 3), torch.empty(n)
+        radii = torch.empty(n, dtype=torch.int32)
         pose = camera.viewmat.detach().double().contiguous().numpy()
         K = camera.K
         intrinsics = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
@@ -237,9 +273,8 @@ class NumbaRasterizer:
             "n_cameras": 1,
             "tile_size": 16,
         }
-        # unbind: the gradient of indexing one by one would be an image of zeros per prefix. In memory the pictures stay
-        # planes, as losses want them
-        pictures = zip(planes.unbind(0), alpha.unbind(0), strict=True)
+        # in memory the pictures stay planes, as losses want them
+        pictures = zip(_Pictures.apply(planes), alpha.unbind(0), strict=True)
         return [
             Rendering(p.permute(1, 2, 0), a, expected, info if k == prefixes - 1 else {})
             for k, (p, a) in enumerate(pictures)

@@ -86,7 +86,9 @@ def _project_one(
     z = R[2, 0] * m0 + R[2, 1] * m1 + R[2, 2] * m2 + view[2, 3]
     depths[i] = z
     radii[i] = 0
-    out[i, OPACITY] = 0.0
+    for column in range(COLUMNS):
+        out[i, column] = 0.0
+    conics[i, 0] = conics[i, 1] = conics[i, 2] = 0.0
     if not (z > NEAR_PLANE):
         return
     iz = 1.0 / z
@@ -264,6 +266,17 @@ def _carry_back_one(
         v_view[i, 9], v_view[i, 10], v_view[i, 11] = p0, p1, p2
 
 
+@njit(error_model="numpy", inline="always")
+def _clear_one(i, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_abs):
+    for column in range(3):
+        v_means[i, column] = v_scales[i, column] = v_features[i, column] = 0.0
+    for column in range(4):
+        v_quats[i, column] = 0.0
+    for column in range(2):
+        v_means2d[i, column] = v_abs[i, column] = 0.0
+    v_opacities[i] = 0.0
+
+
 @njit(parallel=True, error_model="numpy", fastmath={"contract"}, cache=True)
 def project_backward(
     means, quats, scales, opacities, view, intrinsics, width, height, blur, antialiased, moves, splats,
@@ -279,6 +292,7 @@ def project_backward(
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
         sums = np.empty(V_COLUMNS)
         for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
+            _clear_one(i, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_abs)
             if count[i] > 0:
                 sums[:] = 0.0
                 for row in range(first[i], first[i] + count[i]):

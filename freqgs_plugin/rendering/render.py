@@ -159,7 +159,9 @@ def _distinct_prefixes(level: Int[Tensor, " n"], num_levels: int) -> list[int]:
     The first and the last prefix always count, whether or not their levels hold any. So do all where a level lies
     outside of 1..num_levels, which the rasterizer refuses.
     """
-    counts = torch.stack([(level == k).sum() for k in range(1, num_levels + 1)]).tolist()
+    counts = [0] * num_levels
+    if len(level) and int(level.min()) >= 1:
+        counts = torch.bincount(level, minlength=num_levels + 1)[1 : num_levels + 1].tolist()
     rank = []
     for k, count in enumerate(counts, start=1):
         new = count > 0 or k in (1, num_levels) or sum(counts) < len(level)

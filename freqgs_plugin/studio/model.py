@@ -11,13 +11,14 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from freqgs_plugin.functional.image_loss import image_distance
+from freqgs_plugin.functional.image_loss import image_distance, mean_square_as_shown
 from freqgs_plugin.rendering.render import rendered_weight
 from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.config import FreqSplatModelConfig
 from freqgs_plugin.studio.optimizers import adopt_parameters, fuse, scale_schedulers
+from freqgs_plugin.studio.outputs import LazyOutputs
 from freqgs_plugin.studio.targets import TargetCache, ViewTarget
-from freqgs_plugin.studio.viewing import SplatViews, psnr, show
+from freqgs_plugin.studio.viewing import SplatViews, show, to_psnr
 from freqgs_plugin.training.densify import LevelStrategy
 from freqgs_plugin.training.guard import FiniteGuard, NonFiniteError
 from freqgs_plugin.training.regularise import default_dropout, drop_out, opacity_shown, size_shown
@@ -192,14 +193,14 @@ class FreqSplatModel(SplatViews):
         if self.config.use_bilateral_grid and cam_idx is not None:
             height, width = camera.height, camera.width
             images = [self._apply_bilateral_grid(i[None], cam_idx, height, width).squeeze(0) for i in images]
-        return {
-            "rgb": show(images[-1].detach()),
+        outputs = {
             "prefixes": images,
             "accumulation": renderings[-1].alpha,
             "background": background,
             "info": self._info,
             "gaussians": gaussians,
         }
+        return LazyOutputs(outputs, {"rgb": lambda: show(images[-1].detach())})
 
     def _check_gradients(self, trainer: Any) -> None:
         """Before the first optimizer of a step moves: drop the step's gradients if any is not finite."""
@@ -230,7 +231,8 @@ class FreqSplatModel(SplatViews):
     def _densify(self, step: int) -> None:
         """After a training step with finite gradients."""
         assert self._info is not None
-        self.strategy.observe(self.strategy_state, self._info, self._gradient_weights())
+        if step < self.schedule.refine_stop:
+            self.strategy.observe(self.strategy_state, self._info, self._gradient_weights())
         removed = self._remove_unneeded(step)
         with self._lent_levels() as state:
             done = self.strategy.step(self.gauss_params, self._optimizers.optimizers, state, step, self.schedule)
@@ -288,18 +290,19 @@ class FreqSplatModel(SplatViews):
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         if self.training:
-            target = self._training_targets(batch, outputs["background"]).image
+            picture, target = outputs["prefixes"][-1], self._training_targets(batch, outputs["background"]).image
         else:
             target = self.composite_with_background(self._halve(batch["image"]), outputs["background"])
+            picture = outputs["rgb"]
         metrics: dict[str, Any] = {
-            "psnr": psnr(outputs["rgb"], target),
             "gaussian_count": self.num_points,
-            "width": outputs["rgb"].shape[1],
-            "height": outputs["rgb"].shape[0],
+            "width": picture.shape[1],
+            "height": picture.shape[0],
             "skipped_steps": self.guard.skipped,
         }
         self.camera_optimizer.get_metrics_dict(metrics)
-        return metrics
+        # nerfstudio logs one step in ten
+        return LazyOutputs(metrics, {"psnr": lambda: to_psnr(mean_square_as_shown(picture, target))})
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None

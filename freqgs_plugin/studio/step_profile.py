@@ -109,10 +109,8 @@ def instrument(sections: Sections) -> None:
     import torch
     from nerfstudio.engine.optimizers import Optimizers
 
-    from freqgs_plugin.functional.compiled_harmonics import CompiledHarmonics
-    from freqgs_plugin.functional.compiled_image_loss import CompiledImageSums
-    from freqgs_plugin.functional.compiled_pyramid import CompiledReduce
-    from freqgs_plugin.functional.compiled_spectrum import CompiledDistance
+    from freqgs_plugin.functional import compiled_terms
+    from freqgs_plugin.functional.compiled_harmonics import CompiledColours
     from freqgs_plugin.rendering import numba_backend
     from freqgs_plugin.rendering import render as render_module
     from freqgs_plugin.studio import lapsplat
@@ -132,14 +130,17 @@ def instrument(sections: Sections) -> None:
     sections.replace(numba_backend.NumbaRasterizer, "_render", "rasterizer, around its kernels")
     sections.replace(numba_backend._Composite, "backward", "rasterizer, around its kernels")
     sections.replace(render_module, "level_colours", "harmonics and colours")
-    for function, name in (
-        (CompiledHarmonics, "harmonics and colours"),
-        (CompiledImageSums, "loss: L1 and SSIM"),
-        (CompiledDistance, "loss: frequency term"),
-        (CompiledReduce, "loss: REDUCE"),
-    ):
-        sections.replace(function, "forward", name)
-        sections.replace(function, "backward", name)
+    for direction in ("forward", "backward"):
+        sections.replace(CompiledColours, direction, "harmonics and colours")
+        sections.replace(compiled_terms.CompiledTerms, direction, "loss: around its kernels")
+    losses = {
+        "image_sums": "loss: L1 and SSIM",
+        "distance": "loss: frequency term",
+        "halve": "loss: REDUCE",
+        "add_halving_gradient": "loss: REDUCE",
+    }
+    for attribute, name in losses.items():
+        sections.replace(compiled_terms, attribute, name)
     sections.replace(lapsplat, "pyramid_objective", "loss: around its kernels")
     sections.replace(FreqSplatModel, "_training_targets", "loss: targets")
     sections.replace(torch.Tensor, "backward", "autograd: the rest of backward")

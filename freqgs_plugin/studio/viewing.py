@@ -248,6 +248,11 @@ def show(image: Tensor) -> Tensor:
     return image.clamp(0.0, 1.0)
 
 
-def psnr(a: Tensor, b: Tensor) -> Float[Tensor, ""]:
+def psnr(a: Float[Tensor, "*image"], b: Float[Tensor, "*image"]) -> Float[Tensor, ""]:
     """Peak signal to noise ratio of images in [0, 1], dB; at most 120."""
-    return -10 * torch.log10(torch.nn.functional.mse_loss(a, b).clamp_min(1e-12))
+    return to_psnr(torch.nn.functional.mse_loss(a, b))
+
+
+def to_psnr(mean_square: Float[Tensor, ""]) -> Float[Tensor, ""]:
+    """Peak signal to noise ratio of a mean squared error, dB; at most 120."""
+    return -10 * torch.log10(mean_square.clamp_min(1e-12))

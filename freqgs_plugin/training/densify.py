@@ -41,20 +41,19 @@ class LevelStrategy(DefaultStrategy):
     def observe(self, state: dict[str, Any], info: dict[str, Any], weight: Tensor | None) -> None:
         """Collect one step's 2D gradients, divided by `weight` [n]."""
         grads = info["means2d"].absgrad if self.absgrad else info["means2d"].grad
-        grads = grads.clone()
-        if weight is not None:
-            grads /= weight[None, :, None]
-        seen = info["radii"][0] > 0
-        size = grads.new_tensor([info["width"], info["height"]])
-        norm = (grads[0] * size / 2.0).norm(dim=-1)
+        grads, radii = grads[0], info["radii"][0]
         for key in ("grad2d", "count", "radii"):
             if state[key] is None:
-                state[key] = torch.zeros_like(norm)
-        state["grad2d"] += torch.where(seen, norm, 0.0)
-        state["count"] += seen.to(norm.dtype)
-        # by a tensor: CUDA multiplies by the reciprocal of a number, which puts 6 of 120 px over a threshold of 0.05
-        screen = info["radii"][0].to(norm.dtype) / size.max()
-        state["radii"] = torch.maximum(state["radii"], torch.where(seen, screen, 0.0))
+                state[key] = torch.zeros(len(grads), dtype=grads.dtype, device=grads.device)
+        statistics = state["grad2d"], state["count"], state["radii"]
+        if grads.device.type == "cpu" and grads.dtype == torch.float32:
+            from freqgs_plugin.training.compiled_statistics import observe
+
+            tensors = (grads.contiguous(), grads.new_empty(0) if weight is None else weight, radii)
+            arrays = (t.numpy() for t in (*tensors, *statistics))
+            observe(next(arrays), next(arrays), next(arrays), info["width"], info["height"], *arrays)
+        else:
+            _observe_in_torch(grads, weight, radii, info["width"], info["height"], *statistics)
 
     def step(
         self,
@@ -179,3 +178,17 @@ def add_level(params, optimizers: Any, state: dict[str, Any], level: int, opacit
     for key in ("grad2d", "count", "radii"):
         state[key] = None
     return n
+
+
+def _observe_in_torch(
+    grads: Float[Tensor, "n 2"], weight: Tensor | None, radii: Tensor, width: int, height: int,
+    grad2d: Float[Tensor, " n"], count: Float[Tensor, " n"], largest: Float[Tensor, " n"],
+) -> None:  # fmt: skip
+    """`compiled_statistics.observe` on any device."""
+    seen = radii > 0
+    size = grads.new_tensor([width, height])
+    norm = ((grads if weight is None else grads / weight[:, None]) * size / 2.0).norm(dim=-1)
+    grad2d += torch.where(seen, norm, 0.0)
+    count += seen.to(norm.dtype)
+    # by a tensor: CUDA multiplies by the reciprocal of a number, which puts 6 of 120 px over a threshold of 0.05
+    torch.maximum(largest, torch.where(seen, radii.to(norm.dtype) / size.max(), 0.0), out=largest)

@@ -17,9 +17,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from freqgs_plugin.functional.image_loss import Clamp, image_distance, prepare
+from freqgs_plugin.functional.image_loss import Clamp, prepare
 from freqgs_plugin.functional.pyramid import low_pass, reduce
-from freqgs_plugin.functional.spectrum import Size, fast_size, magnitude, magnitude_distance_to
+from freqgs_plugin.functional.spectrum import Size, fast_size, magnitude
+from freqgs_plugin.functional.terms import Terms, prefix_terms
 
 
 @dataclass(frozen=True)
@@ -92,20 +93,24 @@ def pyramid_objective(
     if len(targets.reduced) != m:
         raise ValueError(f"targets are for {len(targets.reduced)} levels, but {m} are rendered. Make them anew.")
 
+    if use_dft and targets.magnitudes is None:
+        raise ValueError("targets lack DFT magnitudes. Make them with `dft=True`, or call with `dft=False`.")
+
     renders = [_planes(prepare(prefix, clamp_mode), mask) for prefix in prefixes]
-    terms = {}
-    for k in range(1, m + 1):
-        weight = image_weight * weights[k - 1] if k == m or lower_image_terms else 0.0
-        if weight != 0:
-            reduced = reduce(renders[k - 1], m - k)
-            terms[f"image_{k}"] = image_distance(reduced, targets.reduced[k - 1], ssim_weight, weight)
-    if use_dft:
-        if targets.magnitudes is None:
-            raise ValueError("targets lack DFT magnitudes. Make them with `dft=True`, or call with `dft=False`.")
+    kept = [k == m or lower_image_terms for k in range(1, m + 1)]
+    terms = Terms(
+        reduced=targets.reduced,
+        image_weights=[image_weight * weight if keep else 0.0 for weight, keep in zip(weights, kept, strict=True)],
+        ssim_weight=ssim_weight,
+        magnitudes=targets.magnitudes if use_dft else None,
+        dft_size=targets.dft_size or (renders[0].shape[-2], renders[0].shape[-1]),
         # the mean over the stacked levels, times their number, is the sum of Eq. 8
-        weight = dft_weight * (m - 1)
-        terms["dft"] = magnitude_distance_to(renders[:-1], targets.magnitudes, dft_norm, targets.dft_size, weight)
-    return terms
+        dft_weight=dft_weight * (m - 1),
+        dft_norm=dft_norm,
+    )
+    names = [f"image_{k}" for k in range(1, m + 1)] + ["dft"]
+    values = prefix_terms(terms, renders)
+    return {name: value for name, value in zip(names, values, strict=True) if value is not None}
 
 
 def _planes(image: Tensor, mask: Tensor | None) -> Tensor:

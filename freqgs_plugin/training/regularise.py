@@ -37,4 +37,4 @@ def drop_out(opacities: Float[Tensor, " n"], rate: float | int, seed: int, step:
     dropped. Opacities above 1 come out as they are; rasterizers cap alpha.
     """
     kept = np.random.default_rng((seed, step)).random(len(opacities), np.float32) >= rate
-    return opacities * torch.from_numpy(kept).to(opacities) / (1.0 - rate)
+    return opacities * torch.from_numpy(kept).to(opacities).div_(1.0 - rate)

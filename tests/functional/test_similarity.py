@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from freqgs_plugin.functional.harmonics import basis, evaluate_in_torch
+from freqgs_plugin.functional.harmonics import basis, evaluate
 from freqgs_plugin.functional.projection import rotation_rows
 from freqgs_plugin.functional.similarity import Similarity, harmonics_rotation
 
@@ -29,7 +29,7 @@ def matrices(quats):
 
 def _evaluate(coefficients, d):
     coefficients = coefficients.expand(len(d), -1, -1)
-    return evaluate_in_torch(coefficients[:, 0], coefficients[:, 1:], d)
+    return evaluate(coefficients[:, 0], coefficients[:, 1:], d)
 
 
 @pytest.mark.parametrize("degree", range(5))

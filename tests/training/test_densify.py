@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from freqgs_plugin.training import densify
 from freqgs_plugin.training.densify import LevelStrategy, add_level
 from freqgs_plugin.training.schedule import Schedule
 
@@ -60,6 +61,23 @@ def test_statistics_are_gsplats():
     seen_once["radii"][0, 1] = 0
     s.observe(state, seen_once, None)
     torch.testing.assert_close(state["grad2d"] / state["count"], torch.tensor([0.02 * 50, 0.02 * 25]))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_compiled_statistics_are_those_in_torch(weighted, assert_close):
+    generator = torch.Generator().manual_seed(3)
+    grads, weight = torch.randn(700, 2, generator=generator), torch.rand(700, generator=generator) + 0.1
+    radii = torch.randint(-1, 40, (700,), generator=generator, dtype=torch.int32).clamp_min(0)
+    state = {"grad2d": None, "count": None, "radii": None}
+    expected = [torch.zeros(700, dtype=torch.float64) for _ in range(3)]
+    for scale in (1.0, 0.3):
+        seen = info([[0.0, 0.0]])
+        seen["means2d"].absgrad, seen["radii"] = (scale * grads)[None], (scale * radii).int()[None]
+        strategy().observe(state, seen, weight if weighted else None)
+        double = weight.double() if weighted else None
+        densify._observe_in_torch((scale * grads).double(), double, (scale * radii).int(), 100, 50, *expected)
+    for name, value in zip(("grad2d", "count", "radii"), expected, strict=True):
+        assert_close(state[name], value, message=name)
 
 
 def test_loss_weights_are_taken_out():

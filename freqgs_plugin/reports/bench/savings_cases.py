@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from freqgs_plugin.functional.attenuation import Attenuation, DistanceDecay, LevelCut
-from freqgs_plugin.functional.harmonics import evaluate, level_colours
+from freqgs_plugin.functional.harmonics import level_colours
 from freqgs_plugin.functional.spectrum import magnitude, magnitude_distance_to
 from freqgs_plugin.rendering.base import PrefixRasterizer, get_rasterizer
 from freqgs_plugin.rendering.render import render, render_prefixes, rendered_weight, shade
@@ -162,7 +162,7 @@ def _harmonics(s: Subject) -> list[Saving]:
 
     def backward(gradient: Tensor) -> Tensor:
         dc, rest = g.features_dc.clone().requires_grad_(), g.features_rest.clone().requires_grad_()
-        evaluate(dc, rest, offsets.clone().requires_grad_()).backward(gradient)
+        level_colours(dc, rest, offsets.clone().requires_grad_(), g.level, g.signed_residuals).backward(gradient)
         assert rest.grad is not None
         return rest.grad[seen]
 

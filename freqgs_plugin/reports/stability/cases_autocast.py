@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 
 from freqgs_plugin.functional.attenuation import DistanceDecay
-from freqgs_plugin.functional.harmonics import evaluate, evaluate_in_torch
+from freqgs_plugin.functional.harmonics import level_colours, level_colours_in_torch
 from freqgs_plugin.functional.image_loss import image_distance
 from freqgs_plugin.functional.pyramid import laplacian, low_pass, reduce, reduce_by_convolution
 from freqgs_plugin.functional.spectrum import band_energy, magnitude, magnitude_distance_to, radial_energy
@@ -116,7 +116,8 @@ def _geometry() -> list[Case]:
         return Camera(leaves["viewmat"], leaves["K"], 37, 29)
 
     def coloured(function: Callable[..., torch.Tensor], leaves: Tensors) -> torch.Tensor:
-        return function(leaves["sh"][:, 0], leaves["sh"][:, 1:], leaves["means"] - view(leaves).centre)
+        level = torch.arange(24) % 2 + 1
+        return function(leaves["sh"][:, 0], leaves["sh"][:, 1:], leaves["means"] - view(leaves).centre, level, True)
 
     def decayed(leaves: Tensors) -> torch.Tensor:
         level = torch.ones(24, dtype=torch.int64)
@@ -130,7 +131,7 @@ def _geometry() -> list[Case]:
 
     return [
         case("camera centre", lambda leaves: view(leaves).centre),
-        case("colours", lambda leaves: coloured(evaluate, leaves)),
-        case("colours in torch", lambda leaves: coloured(evaluate_in_torch, leaves)),
+        case("colours", lambda leaves: coloured(level_colours, leaves)),
+        case("colours in torch", lambda leaves: coloured(level_colours_in_torch, leaves)),
         case("distance decay", decayed),
     ]
