@@ -5,6 +5,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
+from tyro.conf import arg
+
+from freqgs_plugin.commands.options import CommandError, RenderOptions
 from freqgs_plugin.demo.experiments import EXPERIMENTS
 from freqgs_plugin.reports.bench.commands import BENCHES
 
@@ -47,6 +50,18 @@ def demo(
     run_demo(DemoOptions(output_dir, scene, steps, levels), Console())
 
 
+def render(options: Annotated[RenderOptions, arg(name="")] = RenderOptions()) -> None:  # noqa: B008
+    """Draw a trained scene at any level of detail: PNG files, and an MP4 of a camera path.
+
+    Prints how many Gaussians each frame draws, and how long it takes. Levels, budgets, gaze and filters combine.
+    """
+    from rich.console import Console
+
+    from freqgs_plugin.commands.render import run_render
+
+    run_render(options, Console())
+
+
 def stability(
     output_dir: Path = Path("stability-out"),
     only: Literal["geometry", "compositing", "decay", "losses", "autocast", "training"] | None = None,
@@ -71,6 +86,7 @@ def stability(
 
 COMMANDS = {
     "demo": demo,
+    "render": render,
     "stability": stability,
     "bench": BENCHES,
     "experiment": EXPERIMENTS,
@@ -134,7 +150,7 @@ def _expected(error: Exception) -> bool:
     from freqgs_plugin.reports.experiments.options import ExperimentError
     from freqgs_plugin.reports.stability.runner import StabilityError
 
-    ours = (TrainingError, SceneError, StabilityError, BenchError, ExperimentError)
+    ours = (CommandError, TrainingError, SceneError, StabilityError, BenchError, ExperimentError)
     return isinstance(error, (OSError, *ours))
 
 

@@ -21,7 +21,7 @@ def load(config_path: Path) -> Any:
         BenchError: there is no such run, or it is of another method.
     """
     try:
-        with _quiet():
+        with quiet():
             from freqgs_plugin.studio.checkpoint import load_run
 
             return load_run(config_path)
@@ -33,12 +33,12 @@ def load(config_path: Path) -> Any:
 
 def views_of(run: Any) -> list[Any]:
     """The held-out views, or those trained on where none is held out."""
-    with _quiet():
+    with quiet():
         return run.cameras("test") or run.cameras("train")
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """What nerfstudio has to say goes nowhere."""
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -1,0 +1,209 @@
+"""`freqgs render`: pictures of a trained scene at any level of detail, as PNG files and MP4."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from freqgs_plugin.apps.amount import Amount, parse_amount
+from freqgs_plugin.apps.filters import apply_filter
+from freqgs_plugin.apps.foveation import Foveation
+from freqgs_plugin.apps.gaze import Point, gaze_points, salient_point
+from freqgs_plugin.commands.frames import FrameFolder, FrameRecord, write_video
+from freqgs_plugin.commands.options import CommandError, RenderOptions
+from freqgs_plugin.commands.scene import Scene, Shot, open_scene, shots
+from freqgs_plugin.functional.attenuation import Attenuation, DistanceDecay, LevelCut, Product
+from freqgs_plugin.functional.budget import DecayBudget, LevelBudget, in_view
+from freqgs_plugin.functional.cost import RenderTime, calibrate
+from freqgs_plugin.rendering.render import render
+from freqgs_plugin.types import Camera, Gaussians, Rendering
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a scene is drawn, but for the gaze."""
+
+    gaussians: Gaussians
+    attenuation: Attenuation | None
+
+
+def run_render(options: RenderOptions, console: "Console") -> None:
+    """Draw all frames that the folder lacks, and print what each costs.
+
+    Raises:
+        CommandError: options that contradict each other or the scene.
+        OSError: inputs that are not there, or an output folder that cannot be used.
+    """
+    try:
+        amount = None if options.budget is None else parse_amount(options.budget)
+        scene = open_scene(options.load_config, options.ply, options.rasterizer)
+        shot = shots(scene, options.path, options.split, options.size)
+        gazes = _gazes(options, len(shot.cameras))
+        rate = _rate(options, shot)
+        look = _look(options, amount, scene, shot, console)
+        folder = FrameFolder(options.output_dir, _settings(options))
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+    _draw_all(options, scene, shot, gazes, look, folder, console)
+    if rate is not None:
+        path = options.output_dir / "video.mp4"
+        write_video(path, [folder.path(name) for name in shot.names], rate)
+        console.print(str(path), soft_wrap=True)
+
+
+def _gazes(options: RenderOptions, frames: int) -> list[Point | None]:
+    if options.gaze is None:
+        return [None] * frames
+    # refuses other numbers before anything is drawn
+    Foveation((0.5, 0.5), options.gaze_sigma, options.gaze_radius)
+    return gaze_points(options.gaze, frames)
+
+
+def _rate(options: RenderOptions, shot: Shot) -> float | None:
+    """Frames per second of the video; None without one."""
+    rate = options.fps if options.fps is not None else (shot.fps or 24.0)
+    if not 0 < rate <= 1000:
+        raise ValueError(f"fps is {rate:g}; give frames per second above 0, up to 1000.")
+    if options.video == "never" or (options.video == "paths" and shot.fps is None):
+        return None
+    sizes = sorted({(camera.width, camera.height) for camera in shot.cameras})
+    if len(sizes) > 1:
+        found = ", ".join(f"{w}x{h}" for w, h in sizes[:3])
+        raise ValueError(f"a video has one size, and the views have {len(sizes)} ({found} px ...); give --size.")
+    return rate
+
+
+def _settings(options: RenderOptions) -> dict[str, Any]:
+    """What decides about pictures."""
+    left_out = ("output_dir", "video", "fps")
+    chosen = {f.name: getattr(options, f.name) for f in fields(options) if f.name not in left_out}
+    files = [p for p in (options.load_config, options.ply, options.path) if p is not None]
+    chosen["files"] = [p.stat().st_mtime for p in files if p.is_file()]
+    if options.gaze is not None and Path(options.gaze).is_file():
+        chosen["gaze"] = Path(options.gaze).read_text(encoding="utf-8")
+    return {key: str(value) if isinstance(value, Path) else value for key, value in chosen.items()}
+
+
+def _look(options: RenderOptions, amount: Amount | None, scene: Scene, shot: Shot, console: "Console") -> Look:
+    gaussians = scene.gaussians if options.filter == "none" else apply_filter(scene.gaussians, options.filter)
+    parts: list[Attenuation] = []
+    if options.level is not None:
+        parts.append(LevelCut(options.level))
+    decays = gaussians.decay is not None
+    if options.detail is not None and not decays:
+        raise ValueError(f"--detail {options.detail:g}: this scene has no decay; use --level, or train clodsplat.")
+    count = None
+    if amount is not None:
+        count = _count(amount, replace(scene, gaussians=gaussians), shot, console)
+    if decays:
+        parts.append(_decay(scene, options.detail, count))
+    elif count is not None:
+        parts.append(LevelBudget(count))
+    if not parts:
+        return Look(gaussians, None)
+    return Look(gaussians, parts[0] if len(parts) == 1 else Product(tuple(parts)))
+
+
+def _decay(scene: Scene, detail: float | None, count: int | None) -> Attenuation:
+    reference = "frustum_max" if scene.scene_distance is None else "scene"
+    least = 1.0 if detail is None else detail
+    if count is not None:
+        return DecayBudget(count, reference, scene.scene_distance, least=least)
+    return DistanceDecay(least, reference, scene.scene_distance)
+
+
+def _count(amount: Amount, scene: Scene, shot: Shot, console: "Console") -> int:
+    """Gaussians that a budget allows; says so where that is less than the base, and what a time was measured as."""
+    g, camera = scene.gaussians, shot.cameras[0]
+
+    def measure() -> RenderTime:
+        found = calibrate(_measured(scene, camera), max(int(in_view(g, camera).sum()), 16))
+        console.print(f"measured here: {found}", soft_wrap=True)
+        return found
+
+    degree = round((g.features_rest.shape[1] + 1) ** 0.5) - 1
+    count = amount.count(degree, g.decay is not None, camera.width * camera.height, measure)
+    console.print(f"budget of {amount}: at most {count:,} Gaussians per view", soft_wrap=True)
+    base = int((in_view(g, camera) & (g.level == 1)).sum())
+    if count < base and int(g.level.max()) > 1:
+        console.print(f"[yellow]The base alone has {base:,} in the first view: it is drawn in part.", soft_wrap=True)
+    return count
+
+
+def _measured(scene: Scene, camera: Camera) -> Callable[[int, float], tuple[int, int]]:
+    """A picture of so many Gaussians, for `calibrate`."""
+
+    def picture(count: int, _size: float) -> tuple[int, int]:
+        rendering = _picture(scene, scene.gaussians, camera, LevelBudget(count))
+        return int(rendering.info["drawn"]), camera.width * camera.height
+
+    return picture
+
+
+@torch.no_grad()
+def _picture(scene: Scene, gaussians: Gaussians, camera: Camera, attenuation: Attenuation | None) -> Rendering:
+    rendering = render(
+        gaussians,
+        camera,
+        attenuation,
+        rasterizer=scene.rasterizer,
+        background=scene.background,
+        antialiased=scene.antialiased,
+        depth=False,
+    )
+    if rendering.features.is_cuda:
+        torch.cuda.synchronize()
+    return rendering
+
+
+def _draw_all(
+    options: RenderOptions, scene: Scene, shot: Shot, gazes: list[Point | None], look: Look, folder: FrameFolder,
+    console: "Console",
+) -> None:  # fmt: skip
+    from rich.progress import track
+
+    missing = [i for i, name in enumerate(shot.names) if name not in folder.records]
+    if missing:
+        # the first picture compiles
+        _picture(scene, look.gaussians, shot.cameras[missing[0]], look.attenuation)
+    for i in track(missing, "Drawing", console=console, disable=not console.is_terminal):
+        camera, gaze, attenuation = shot.cameras[i], gazes[i], look.attenuation
+        if options.gaze is not None:
+            if gaze is None:
+                base = _picture(scene, look.gaussians, camera, LevelCut(1))
+                gaze = salient_point(base.features.clamp(0, 1).cpu().numpy())
+            fovea = Foveation(gaze, options.gaze_sigma, options.gaze_radius)
+            attenuation = fovea if attenuation is None else Product((attenuation, fovea))
+        start = time.perf_counter()
+        rendering = _picture(scene, look.gaussians, camera, attenuation)
+        milliseconds = 1e3 * (time.perf_counter() - start)
+        record = FrameRecord(shot.names[i], int(rendering.info["drawn"]), round(milliseconds, 2), gaze)
+        folder.add(record, rendering.features.clamp(0, 1).cpu().numpy())
+    _report(folder, shot, len(scene.gaussians), console)
+
+
+def _report(folder: FrameFolder, shot: Shot, total: int, console: "Console") -> None:
+    """A line per frame, or of many frames the range."""
+    from rich.table import Table
+
+    records = [folder.records[name] for name in shot.names]
+    empty = [r.name for r in records if r.drawn == 0]
+    times, counts = sorted(r.milliseconds for r in records), sorted(r.drawn for r in records)
+    table = Table(title=f"{len(records)} frames of {total:,} Gaussians")
+    for heading in ("frame", "drawn", "ms"):
+        table.add_column(heading, justify="right")
+    if len(records) <= 20:
+        for record in records:
+            table.add_row(record.name, f"{record.drawn:,}", f"{record.milliseconds:.1f}")
+    for name, at in (("least", 0), ("median", len(records) // 2), ("most", -1)):
+        table.add_row(name, f"{counts[at]:,}", f"{times[at]:.1f}")
+    console.print(table)
+    if empty:
+        names = ", ".join(empty[:5]) + (" ..." if len(empty) > 5 else "")
+        console.print(f"[yellow]{len(empty)} frames draw no Gaussian: {names}. The path may have left the scene.")

@@ -1,0 +1,135 @@
+"""`freqgs render` on trained runs, as a user calls it."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from running import SIZE, command
+
+from freqgs_plugin.io.images import read_image, to_uint8
+from freqgs_plugin.io.parameters import GROUPS, RawGaussians
+from freqgs_plugin.io.ply import write_ply
+from freqgs_plugin.studio.checkpoint import load_run
+
+pytestmark = pytest.mark.slow
+
+
+def render(*arguments, timeout=200):
+    return command("freqgs", "render", *map(str, arguments), timeout=timeout)
+
+
+def frames(folder):
+    return {r["name"]: r for r in json.loads((folder / "frames.json").read_text())["frames"]}
+
+
+def camera_path(run, folder, count=3):
+    """What the viewer saves: OpenGL poses by rows, vertical field of view in degrees."""
+    views = []
+    for view in run.cameras("test")[:count]:
+        pose = torch.linalg.inv(view.camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1]).double())
+        fov = 2 * np.degrees(np.arctan(view.camera.height / 2 / float(view.camera.K[1, 1])))
+        views.append({"camera_to_world": pose.flatten().tolist(), "fov": fov, "aspect": 1})
+    path = folder / "path.json"
+    path.write_text(json.dumps({"render_width": 80, "render_height": 64, "fps": 8, "camera_path": views}))
+    return path
+
+
+def test_levels_of_held_out_views(trained, tmp_path):
+    run = load_run(trained)
+    done = render("--load-config", trained, "--output-dir", tmp_path / "base", "--level", 1)
+    assert done.code == 0, str(done)
+    base = frames(tmp_path / "base")
+    assert {r["drawn"] for r in base.values()} == {int((run.gaussians.level == 1).sum())}
+    done = render("--load-config", trained, "--output-dir", tmp_path / "all")
+    assert done.code == 0, str(done)
+    for view in run.cameras("test"):
+        name = view.name.rsplit(".", 1)[0]
+        with torch.no_grad():
+            expected = run.model.draw(run.gaussians, view.camera, run.background).features
+        shown = read_image(tmp_path / "all" / f"{name}.png")
+        assert np.abs(shown.astype(int) - to_uint8(expected.numpy())).max() <= 1
+        assert (shown != read_image(tmp_path / "base" / f"{name}.png")).mean() > 0.1
+    assert not (tmp_path / "all" / "video.mp4").exists()
+    # once more: nothing is drawn again
+    before = (tmp_path / "all" / "frames.json").stat().st_mtime_ns
+    assert render("--load-config", trained, "--output-dir", tmp_path / "all").code == 0
+    assert (tmp_path / "all" / "frames.json").stat().st_mtime_ns == before
+
+
+def test_a_path_with_budget_gaze_and_filter(trained, tmp_path):
+    path = camera_path(load_run(trained), tmp_path)
+    out = tmp_path / "out"
+    more = ["--budget", 300, "--gaze", "auto", "--filter", "xray", "--size", 96, 64]
+    done = render("--load-config", trained, "--path", path, "--output-dir", out, *more)
+    assert done.code == 0, str(done)
+    records = frames(out)
+    assert list(records) == ["frame_00000", "frame_00001", "frame_00002"]
+    assert all(0 < r["drawn"] <= 300 and len(r["gaze"]) == 2 for r in records.values())
+    assert read_image(out / "frame_00001.png").shape == (64, 96, 3)
+    assert (out / "video.mp4").stat().st_size > 0
+    assert "at most 300 Gaussians" in done.text
+
+
+def test_a_path_shows_what_the_views_show(trained, tmp_path):
+    run = load_run(trained)
+    path = camera_path(run, tmp_path)
+    assert render("--load-config", trained, "--path", path, "--output-dir", tmp_path / "p").code == 0
+    for i, view in enumerate(run.cameras("test")):
+        with torch.no_grad():
+            expected = to_uint8(run.model.draw(run.gaussians, view.camera, run.background).features.numpy())
+        shown = read_image(tmp_path / "p" / f"frame_{i:05d}.png").astype(int)
+        assert shown.shape == (SIZE[1], SIZE[0], 3)
+        assert np.abs(shown - expected).mean() < 0.2
+
+
+def test_detail_and_time_of_a_scene_with_decay(faded, tmp_path):
+    for name, more in (("far", ["--detail", 20]), ("all", []), ("quick", ["--budget", "1s"])):
+        done = render("--load-config", faded, "--output-dir", tmp_path / name, *more)
+        assert done.code == 0, str(done)
+    far, everything = frames(tmp_path / "far"), frames(tmp_path / "all")
+    assert all(far[name]["drawn"] <= everything[name]["drawn"] for name in everything)
+    for name in everything:
+        change = read_image(tmp_path / "far" / f"{name}.png") != read_image(tmp_path / "all" / f"{name}.png")
+        assert change.mean() > 0.1
+    assert "measured here:" in done.text
+
+
+def test_a_ply_along_a_path(trained, tmp_path):
+    run = load_run(trained)
+    rows = run.gaussians.level == 1
+    parameters = {name: run.model.gauss_params[name].detach()[rows] for name in GROUPS}
+    write_ply(tmp_path / "base.ply", RawGaussians(**parameters), antialiased=run.antialiased)
+    path = camera_path(run, tmp_path)
+    done = render("--ply", tmp_path / "base.ply", "--path", path, "--output-dir", tmp_path / "out")
+    assert done.code == 0, str(done)
+    assert {r["drawn"] for r in frames(tmp_path / "out").values()} == {int(rows.sum())}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "nothing to draw"),
+        (("--load-config", "nowhere.yml"), "nowhere.yml is no file"),
+        (("--load-config", "RUN", "--detail", "3"), "no decay"),
+        (("--load-config", "RUN", "--level", "-1"), "level is -1"),
+        (("--load-config", "RUN", "--budget", "0"), "at least one"),
+        (("--load-config", "RUN", "--gaze", "2,2"), "outside of the image"),
+        (("--load-config", "RUN", "--gaze", "0.5,0.5", "--gaze-sigma", "0"), "sigma is 0"),
+        (("--load-config", "RUN", "--size", "0", "5"), "at least 1 px"),
+        (("--load-config", "RUN", "--fps", "0"), "fps is 0"),
+        (("--load-config", "RUN", "--path", "nowhere.json"), "nowhere.json is no file"),
+        (("--load-config", "RUN", "--path", "RUN"), "is no camera path"),
+    ],
+)
+def test_what_cannot_be_drawn_is_said(trained, tmp_path, monkeypatch, capsys, arguments, message):
+    from freqgs_plugin.cli import main
+
+    given = [str(trained) if a == "RUN" else a for a in arguments]
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["render", *given])
+    assert ended.value.code == 1
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error
+    assert not (tmp_path / "renders").exists()
