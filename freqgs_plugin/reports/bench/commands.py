@@ -83,6 +83,22 @@ def savings(load_config: Path, options: Options = BenchOptions()) -> None:  # no
     run_bench(bench, options, _console(), "--load-config", "RUN/config.yml")
 
 
+def apps(load_config: Path, options: Options = BenchOptions()) -> None:  # noqa: B008
+    """Measure foveation by image size, and an index of the base against one of everything: time and error.
+
+    Args:
+        load_config: config.yml of a trained run of several levels.
+        options: where to write, and how to measure.
+    """
+    from freqgs_plugin.reports.bench.apps import app_subject, apps_bench
+    from freqgs_plugin.reports.bench.runner import run_bench
+    from freqgs_plugin.reports.bench.trained import load, views_of
+
+    run = load(load_config)
+    bench = apps_bench(options, app_subject(run, views_of(run)))
+    run_bench(bench, options, _console(), "--load-config", "RUN/config.yml")
+
+
 def _console() -> Any:
     """Tables are not folded to the 80 columns that a file or a pipe would have."""
     from rich.console import Console
@@ -90,5 +106,13 @@ def _console() -> Any:
     return Console() if sys.stdout.isatty() else Console(width=200)
 
 
-BENCHES = {"raster": raster, "cuda": cuda, "scaling": scaling, "accuracy": accuracy, "step": step, "savings": savings}
+BENCHES = {
+    "raster": raster,
+    "cuda": cuda,
+    "scaling": scaling,
+    "accuracy": accuracy,
+    "step": step,
+    "savings": savings,
+    "apps": apps,
+}
 """name on the command line -> function"""
