@@ -64,9 +64,18 @@ def detail_slider(largest: float) -> ViewerSlider:
     )
 
 
+class TenthsNumber(ViewerNumber):
+    """A number with one decimal; viser would round what is typed to whole ones, as the number at first is."""
+
+    def _create_gui_handle(self, viser_server: Any) -> None:
+        self.gui_handle = viser_server.gui.add_number(
+            self.name, self.default_value, step=0.1, disabled=self.disabled, visible=self.visible, hint=self.hint
+        )
+
+
 def budget_number() -> ViewerNumber:
     """How many thousand Gaussians a view may have; 0: as many as it takes."""
-    return ViewerNumber(
+    return TenthsNumber(
         name="Budget (thousands)",
         default_value=0.0,
         hint="Draws at most so many thousand Gaussians, those that show most; 0: no bound.",

@@ -150,8 +150,8 @@ class Panel(ViewerElement[str]):
         if choice.value == CLICK:
             if event.client is None:
                 return
-            self.say("click", f"Click in the picture to place the {about}.")
             self._clicks.next(event.client, about, act)
+            self.say("click", f"Click in the picture to place the {about}.")
         else:
             self.say("click", None)
             self.say(about, None)

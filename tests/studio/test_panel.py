@@ -20,8 +20,16 @@ from freqgs_plugin.studio.controls import detail_slider, lod_slider
 from freqgs_plugin.studio.filtering import FilterCache
 from freqgs_plugin.studio.panel import Panel
 from freqgs_plugin.studio.viewing import show
+from freqgs_plugin.types import Gaussians
 
 pytestmark = pytest.mark.slow
+NOTHING = Gaussians(
+    *(torch.zeros(0, k) for k in (3, 4, 3)),
+    torch.zeros(0),
+    torch.zeros(0, 3),
+    torch.zeros(0, 0, 3),
+    torch.zeros(0, dtype=torch.int32),
+)
 
 
 @pytest.fixture(scope="module")
@@ -382,7 +390,7 @@ def test_without_several_levels_there_is_less_to_choose():
         panel.install(server)
         assert visible(server.handles) - {"Detail scale"} == {"Mode", "Drawn"}
         panel.gaze.value = "middle"
-        assert panel.around(None) == []
+        assert panel.around(NOTHING) == []
 
 
 def test_the_next_click_of_whoever_asked_places_the_gaze():
