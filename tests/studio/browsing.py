@@ -71,10 +71,16 @@ class Viewer:
             assert self._child.poll() is None, self._log.read_text()
             return listening(self.port)
 
-        wait_until(up, "ns-viewer")
+        try:
+            wait_until(up, "ns-viewer")
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_):
+        if self._child.poll() is not None:
+            return
         os.killpg(self._child.pid, signal.SIGTERM)
         try:
             self._child.wait(10)
@@ -169,6 +175,15 @@ class Page:
         self.page.mouse.move(x + dx, y + dy, steps=5)
         self.page.mouse.up()
 
+    def take_a_photographs_place(self):
+        """Click the first photograph that is found in the picture: the camera goes there."""
+        for y in range(80, WINDOW["height"], 20):
+            for x in range(20, WINDOW["width"] - PANEL, 20):
+                self.page.mouse.move(x, y)
+                if self.page.evaluate("document.body.style.cursor") == "pointer":
+                    self.page.mouse.click(x, y)
+                    return
+
     def slide(self, share, smallest=1, largest=None):
         """Drag a slider's thumb, by default the one for levels or scales, to `share` of its way."""
         largest = self._largest if largest is None else largest
@@ -202,24 +217,27 @@ def away(page):
     page.page.wait_for_timeout(3000)
 
 
-def screenshots(config, folder, turn, closer):
+def screenshots(config, folder, closer):
     """Pages of `ns-viewer` on a run of several levels, `viewer_*.png`: as it starts, and with each control in use.
 
-    The camera is first turned by dragging so many px, and moved closer by so many px of the wheel.
+    The camera is that of a photograph, moved closer by so many turns of the wheel.
     """
     with sync_playwright() as playwright, Viewer(config, folder / "viewer.log") as viewer:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         page = Page(browser, viewer.port)
         wait_until(page.drawn, "a picture")
+        page.take_a_photographs_place()
         page.press("Hide Train Cams")
-        page.drag(*turn)
-        page.page.mouse.wheel(0, -closer)
+        page.page.mouse.move(WINDOW["width"] / 3, WINDOW["height"] / 2)
+        for _ in range(closer):
+            page.page.mouse.wheel(0, -200)
+            page.page.wait_for_timeout(300)
 
         def shoot(name):
             away(page)
             picture = Image.open(io.BytesIO(page.page.screenshot())).convert("RGB")
             # few colours: small files
-            picture.quantize(192).save(folder / f"viewer_{name}.png", optimize=True)
+            picture.quantize(256, kmeans=3).save(folder / f"viewer_{name}.png", optimize=True)
 
         shoot("prefix")
         page.choose("Mode", "band")
@@ -229,18 +247,17 @@ def screenshots(config, folder, turn, closer):
         shoot("budget")
         page.choose("Mode", "prefix")
         page.choose("Gaze", "click")
-        page.place(0.45, 0.55)
+        page.place(0.48, 0.5)
         shoot("gaze")
         page.choose("Gaze", "off")
         page.choose("Filter", "xray")
         shoot("filter")
         page.choose("Filter", "off")
         page.choose("Focus", "click")
-        page.place(0.45, 0.55)
+        page.place(0.48, 0.5)
         shoot("focus")
         browser.close()
 
 
 if __name__ == "__main__":
-    numbers = [float(word) for word in sys.argv[3:6]] or [0.0, 0.0, 0.0]
-    screenshots(Path(sys.argv[1]), Path(sys.argv[2]), numbers[:2], numbers[2])
+    screenshots(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) > 3 else 0)
