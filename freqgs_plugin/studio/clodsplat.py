@@ -17,10 +17,11 @@ from freqgs_plugin.functional.budget import DecayBudget
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.rendering.render import render_prefixes
 from freqgs_plugin.studio.config import FreqSplatModelConfig
-from freqgs_plugin.studio.controls import Stopwatch, budget_of, detail_slider, in_viewer
+from freqgs_plugin.studio.controls import Stopwatch, detail_slider, in_viewer
 from freqgs_plugin.studio.model import FreqSplatModel
 from freqgs_plugin.studio.optimizers import set_rate
 from freqgs_plugin.studio.outputs import LazyOutputs
+from freqgs_plugin.studio.panel import Panel
 from freqgs_plugin.studio.starting import start_from
 from freqgs_plugin.studio.targets import ViewTarget
 from freqgs_plugin.studio.viewing import psnr, show, uncached_property
@@ -125,7 +126,6 @@ class ClodSplatModel(FreqSplatModel):
         self._decays = False
         self._started = False
         self._scene_distance = 1.0
-        self.detail = detail_slider(2 * max(self.config.largest_scale, 1.5))
 
     def _initial_parameters(self) -> dict[str, torch.nn.Parameter]:
         parameters = super()._initial_parameters()
@@ -176,10 +176,17 @@ class ClodSplatModel(FreqSplatModel):
     def _attenuation(self) -> DistanceDecay | None:
         return self.attenuation(1.0)
 
-    def _viewer_attenuation(self) -> Attenuation | None:
-        decay, count = self.attenuation(float(self.detail.value)), budget_of(self.budget)
+    def _make_controls(self) -> Panel:
+        return Panel(detail_slider(2 * max(self.config.largest_scale, 1.5)), ("scale", "all", "budget"), 1)
+
+    def _viewer_scale(self) -> float:
+        """The virtual distance scale that the viewer's controls ask for."""
+        return 1.0 if self.controls.mode.value == "all" else float(self.controls.slider.value)
+
+    def _viewer_attenuation(self, gaussians: Gaussians, camera: Camera) -> Attenuation | None:
+        decay, count = self.attenuation(self._viewer_scale()), self.controls.count()
         if decay is None:
-            return super()._viewer_attenuation()
+            return super()._viewer_attenuation(gaussians, camera)
         if count is None:
             return decay
         return DecayBudget(
@@ -359,7 +366,7 @@ class ClodSplatModel(FreqSplatModel):
             return show(rendering.features)
 
         def drawn_share() -> Tensor:
-            scale = float(self.detail.value) if in_viewer() else self.config.largest_scale
+            scale = self._viewer_scale() if in_viewer() else self.config.largest_scale
             less = self.attenuation(scale)
             if less is None:
                 kept = torch.ones_like(gaussians.opacities)

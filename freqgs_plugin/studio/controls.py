@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from nerfstudio.viewer.viewer_elements import ViewerNumber, ViewerSlider, ViewerText
+from nerfstudio.viewer.viewer_elements import ViewerElement, ViewerNumber, ViewerSlider, ViewerText
 
 from freqgs_plugin.functional.attenuation import LevelCut
 
@@ -64,12 +64,22 @@ def detail_slider(largest: float) -> ViewerSlider:
     )
 
 
+class TenthsNumber(ViewerNumber):
+    """A number with one decimal; viser would round what is typed to whole ones, as the number at first is."""
+
+    def _create_gui_handle(self, viser_server: Any) -> None:
+        self.gui_handle = viser_server.gui.add_number(
+            self.name, self.default_value, step=0.1, disabled=self.disabled, visible=self.visible, hint=self.hint
+        )
+
+
 def budget_number() -> ViewerNumber:
     """How many thousand Gaussians a view may have; 0: as many as it takes."""
-    return ViewerNumber(
+    return TenthsNumber(
         name="Budget (thousands)",
         default_value=0.0,
         hint="Draws at most so many thousand Gaussians, those that show most; 0: no bound.",
+        visible=False,
     )
 
 
@@ -95,9 +105,63 @@ def drawn_text() -> ViewerText:
     return WrittenText(name="Drawn", default_value="-", disabled=True, hint="Gaussians drawn / all, render time")
 
 
+class Note(ViewerElement[str]):
+    """Lines of text that only the program writes, hidden while there are none."""
+
+    def __init__(self) -> None:
+        super().__init__("Note", visible=False)
+        self._text = ""
+
+    def _create_gui_handle(self, viser_server: Any) -> None:
+        self.gui_handle = viser_server.gui.add_markdown(self._text, visible=self.visible)
+
+    def install(self, viser_server: Any) -> None:
+        self._create_gui_handle(viser_server)
+
+    @property
+    def value(self) -> str:
+        return self._text
+
+    @value.setter
+    def value(self, text: str) -> None:
+        self._text, self.visible = text, bool(text)
+        handle: Any = self.gui_handle
+        if handle is not None:
+            handle.content, handle.visible = text, self.visible
+
+
+def gaze_slider() -> ViewerSlider:
+    """Slider over the radius of full detail around a gaze."""
+    return ViewerSlider(
+        name="Gaze radius",
+        default_value=0.1,
+        min_value=0.0,
+        max_value=0.5,
+        step=0.01,
+        hint="Of the disc in which nothing is taken away: share of the picture's longer side.",
+    )
+
+
+def focus_slider() -> ViewerSlider:
+    """Slider over the radius of full detail around a point in the world."""
+    return ViewerSlider(
+        name="Focus radius",
+        default_value=0.2,
+        min_value=0.02,
+        max_value=1.0,
+        step=0.02,
+        hint="Of the ball around the clicked point: share of the distance from which it was clicked.",
+    )
+
+
 def level_cut(slider: ViewerSlider) -> LevelCut:
     """The attenuation that the slider asks for."""
     return LevelCut(float(slider.value))
+
+
+def band_of(slider: ViewerSlider) -> int:
+    """The whole level nearest to the slider."""
+    return math.floor(float(slider.value) + 0.5)
 
 
 class Stopwatch:

@@ -9,13 +9,15 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from freqgs_plugin.functional.attenuation import Attenuation, LevelCut, Product
+from freqgs_plugin.functional.budget import LevelBudget, in_view
 from freqgs_plugin.functional.pyramid import max_levels, reduce
 from freqgs_plugin.rendering.render import render_prefixes
 from freqgs_plugin.studio.config import FreqSplatModelConfig
-from freqgs_plugin.studio.controls import level_cut, lod_slider
+from freqgs_plugin.studio.controls import band_of, level_cut, lod_slider
 from freqgs_plugin.studio.model import FreqSplatModel
 from freqgs_plugin.studio.optimizers import restart
 from freqgs_plugin.studio.outputs import LazyOutputs
+from freqgs_plugin.studio.panel import Panel
 from freqgs_plugin.studio.targets import ViewTarget
 from freqgs_plugin.studio.viewing import psnr, show
 from freqgs_plugin.training.densify import Growth, LevelStrategy, add_level
@@ -96,7 +98,6 @@ class LapSplatModel(FreqSplatModel):
         super().populate_modules()
         self._stage = 1
         self._num_levels = self.config.num_levels
-        self.lod = lod_slider(self.config.num_levels)
 
     # -- schedule and densification -------------------------------------------------------------------------------
 
@@ -218,13 +219,36 @@ class LapSplatModel(FreqSplatModel):
         super().set_extra_state(state)
         self._stage = int(state["stage"])
         self._num_levels = int(state["num_levels"])
-        self.lod = lod_slider(self._num_levels)
+        self.controls.set_slider(lod_slider(self._num_levels), self._num_levels)
 
     # -- pictures, evaluation, export -----------------------------------------------------------------------------
 
-    def _viewer_attenuation(self) -> Attenuation | None:
-        cut, budget = level_cut(self.lod), super()._viewer_attenuation()
-        return cut if budget is None else Product((cut, budget))
+    def _make_controls(self) -> Panel:
+        levels = self.config.num_levels
+        return Panel(
+            lod_slider(levels), ("prefix", "all", "band", "budget") if levels > 1 else ("all", "budget"), levels
+        )
+
+    def _viewer_attenuation(self, gaussians: Gaussians, camera: Camera) -> Attenuation | None:
+        mode, count = self.controls.mode.value, self.controls.count()
+        self._say_if_under_the_base(gaussians, camera, count)
+        if mode == "all":
+            return None
+        cut = LevelCut(band_of(self.controls.slider)) if mode == "band" else level_cut(self.controls.slider)
+        return cut if count is None else Product((cut, LevelBudget(count)))
+
+    def _viewer_subtrahend(self) -> Attenuation | None:
+        level = band_of(self.controls.slider)
+        return LevelCut(level - 1) if self.controls.mode.value == "band" and level > 1 else None
+
+    def _say_if_under_the_base(self, gaussians: Gaussians, camera: Camera, count: int | None) -> None:
+        """A note where a budget does not hold level 1."""
+        text = None
+        if count is not None and count < int((gaussians.level == 1).sum()):
+            base = int((in_view(gaussians, camera) & (gaussians.level == 1)).sum())
+            if count < base:
+                text = f"The budget of {count:,} is below level 1, of which {base:,} are in view: it is drawn in part."
+        self.controls.say("base", text)
 
     def _more_outputs(
         self, gaussians: Gaussians, camera: Camera, background: Tensor, notes: dict[str, float]

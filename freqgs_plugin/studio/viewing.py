@@ -1,6 +1,7 @@
 """What both methods show: splatfacto with a swappable rasterizer, its pictures, evaluation and export."""
 
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -13,16 +14,18 @@ from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel, get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from freqgs_plugin.functional.attenuation import Attenuation
+from freqgs_plugin.functional.attenuation import Attenuation, Product
 from freqgs_plugin.functional.budget import LevelBudget
 from freqgs_plugin.functional.image_loss import ssim
 from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
 from freqgs_plugin.rendering.render import render
 from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.config import FreqSplatModelConfig
-from freqgs_plugin.studio.controls import Stopwatch, budget_number, budget_of, drawn_text, in_viewer, uninterrupted
+from freqgs_plugin.studio.controls import Stopwatch, in_viewer, uninterrupted
+from freqgs_plugin.studio.filtering import FilterCache
 from freqgs_plugin.studio.lpips import lpips_if_available
 from freqgs_plugin.studio.outputs import LazyOutputs
+from freqgs_plugin.studio.panel import OFF, Panel
 from freqgs_plugin.training.initialise import initial_parameters, random_points
 from freqgs_plugin.types import Camera, Gaussians, Rendering, Splats
 
@@ -64,8 +67,8 @@ class SplatViews(SplatfactoModel):
         )
         self.crop_box = None
         self.step = 0
-        self.drawn = drawn_text()
-        self.budget = budget_number()
+        self.controls = self._make_controls()
+        self._filtered = FilterCache()
         self._sh_degree = 0
         self._rasterizer: Rasterizer | None = None
 
@@ -98,10 +101,18 @@ class SplatViews(SplatfactoModel):
         """How the scene is drawn wherever no control asks for something else; None: as it is."""
         return None
 
-    def _viewer_attenuation(self) -> Attenuation | None:
-        """What the viewer's controls ask for."""
-        count = budget_of(self.budget)
+    def _make_controls(self) -> Panel:
+        """The viewer's controls."""
+        raise NotImplementedError
+
+    def _viewer_attenuation(self, gaussians: Gaussians, camera: Camera) -> Attenuation | None:
+        """What mode, slider and budget ask for."""
+        count = self.controls.count()
         return self._attenuation() if count is None else LevelBudget(count)
+
+    def _viewer_subtrahend(self) -> Attenuation | None:
+        """What mode and slider take away from the picture, which then is shown around mid grey; None: nothing."""
+        return None
 
     def _more_outputs(
         self, gaussians: Gaussians, camera: Camera, background: Tensor, notes: dict[str, float]
@@ -195,17 +206,20 @@ class SplatViews(SplatfactoModel):
 
     @torch.no_grad()
     def _view_outputs(self, camera: Camera, background: Tensor) -> dict[str, Any]:
-        gaussians = self.gaussians()
+        viewer = in_viewer()
+        gaussians = self._viewer_gaussians() if viewer else self.gaussians()
         if self.crop_box is not None:
             gaussians = gaussians.select(self.crop_box.within(gaussians.means).flatten())
-        viewer = in_viewer()
-        attenuation = self._viewer_attenuation() if viewer else self._attenuation()
         # the first picture imports and compiles
         finish = uninterrupted() if self._rasterizer is None else nullcontext()
         with Stopwatch(self.device) as watch, finish:
-            rendering = self.draw(gaussians, camera, background, attenuation, depth=True)
+            if viewer:
+                rendering = self._viewer_rendering(gaussians, camera, background)
+            else:
+                rendering = self.draw(gaussians, camera, background, self._attenuation(), depth=True)
         if viewer:
-            self.drawn.value = f"{rendering.info['drawn']:,} / {self.num_points:,}, {watch.milliseconds:.0f} ms"
+            drawn = f"{rendering.info['drawn']:,} / {self.num_points:,}, {watch.milliseconds:.0f} ms"
+            self.controls.drawn.value = drawn
         depth = torch.where(rendering.alpha > 0, rendering.depth, rendering.depth.max())
         ready = {
             "rgb": show(rendering.features),
@@ -215,6 +229,36 @@ class SplatViews(SplatfactoModel):
         }
         notes: dict[str, float] = {}
         return LazyOutputs(ready, self._more_outputs(gaussians, camera, background, notes), notes)
+
+    def _viewer_gaussians(self) -> Gaussians:
+        """The scene, with the filter that the viewer's controls ask for."""
+        name = self.controls.filter.value
+        if name == OFF:
+            self._filtered.clear()
+            self.controls.say("filter", None)
+            return self.gaussians()
+        try:
+            tensors = [*self.gauss_params.values(), self.level]
+            filtered = self._filtered.get(name, self.gaussians, tensors, self._sh_degree)  # pyright: ignore
+        except ValueError as error:
+            self.controls.say("filter", f"Not filtered: {error}")
+            return self.gaussians()
+        self.controls.say("filter", None)
+        return filtered
+
+    def _viewer_rendering(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> Rendering:
+        """The picture that the viewer's controls ask for."""
+        around = self.controls.around(gaussians)
+
+        def draw(attenuation: Attenuation | None) -> Rendering:
+            parts = around if attenuation is None else [attenuation, *around]
+            product = parts[0] if len(parts) == 1 else Product(tuple(parts)) if parts else None
+            return self.draw(gaussians, camera, background, product, depth=True)
+
+        rendering, less = draw(self._viewer_attenuation(gaussians, camera)), self._viewer_subtrahend()
+        if less is None:
+            return rendering
+        return replace(rendering, features=0.5 + rendering.features - draw(less).features)
 
     # -- evaluation and export ------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Starts `ns-viewer` and opens its page in a browser. As a program: writes a screenshot of a trained run."""
+"""Starts `ns-viewer` and opens its page in a browser. As a program: writes screenshots of a trained run."""
 
 import io
 import os
@@ -71,10 +71,16 @@ class Viewer:
             assert self._child.poll() is None, self._log.read_text()
             return listening(self.port)
 
-        wait_until(up, "ns-viewer")
+        try:
+            wait_until(up, "ns-viewer")
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_):
+        if self._child.poll() is not None:
+            return
         os.killpg(self._child.pid, signal.SIGTERM)
         try:
             self._child.wait(10)
@@ -115,17 +121,73 @@ class Page:
 
         return wait_until(quiet, f"{count} Gaussians to be drawn; it says {self.drawn()}")
 
-    def picture(self, path):
+    def look(self):
         """The rendered part of the page."""
         clip = {"x": 0, "y": 60, "width": WINDOW["width"] - PANEL, "height": WINDOW["height"] - 60}
         data = self.page.screenshot(clip=clip)
-        path.write_bytes(data)
-        self.page.screenshot(path=path.with_name(f"page_{path.name}"))
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(float)
 
-    def slide(self, share):
-        """Drag the slider's thumb to `share` of its way."""
-        thumb = self.page.locator(f'[role="slider"][aria-valuemin="1"][aria-valuemax="{self._largest}"]')
+    def picture(self, path):
+        """The same, and it is kept, with the whole page beside it."""
+        self.page.screenshot(path=path.with_name(f"page_{path.name}"))
+        found = self.look()
+        Image.fromarray(found.astype(np.uint8)).save(path)
+        return found
+
+    def note(self):
+        """What the panel says about its controls, as one line."""
+        return " ".join(self.page.locator("p:visible").all_inner_texts())
+
+    def shows(self, label):
+        """Whether there is a control with this label."""
+        return self.page.get_by_text(label, exact=True).first.is_visible()
+
+    def choose(self, label, option):
+        """Pick an option of a drop-down list."""
+        field = self.page.get_by_label(label, exact=True).first
+        field.scroll_into_view_if_needed()
+        field.click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
+    def enter(self, label, number):
+        """Type a number."""
+        field = self.page.get_by_label(label, exact=True).first
+        field.scroll_into_view_if_needed()
+        field.fill(str(number))
+        field.press("Enter")
+
+    def press(self, label):
+        self.page.get_by_role("button", name=label, exact=True).click()
+
+    def place(self, x, y):
+        """Click in the picture, at shares of its width and height, once the panel asks for it."""
+        wait_until(lambda: "Click in the picture" in self.note(), "being asked to click")
+        self.page.wait_for_timeout(300)
+        box = self.page.locator("canvas").first.bounding_box()
+        self.page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        wait_until(lambda: "Click in the picture" not in self.note(), "the click to arrive")
+
+    def drag(self, dx, dy):
+        """Turn the camera around what it looks at, by dragging the picture so many px."""
+        x, y = WINDOW["width"] / 3, WINDOW["height"] / 2
+        self.page.mouse.move(x, y)
+        self.page.mouse.down()
+        self.page.mouse.move(x + dx, y + dy, steps=5)
+        self.page.mouse.up()
+
+    def take_a_photographs_place(self):
+        """Click the first photograph that is found in the picture: the camera goes there."""
+        for y in range(80, WINDOW["height"], 20):
+            for x in range(20, WINDOW["width"] - PANEL, 20):
+                self.page.mouse.move(x, y)
+                if self.page.evaluate("document.body.style.cursor") == "pointer":
+                    self.page.mouse.click(x, y)
+                    return
+
+    def slide(self, share, smallest=1, largest=None):
+        """Drag a slider's thumb, by default the one for levels or scales, to `share` of its way."""
+        largest = self._largest if largest is None else largest
+        thumb = self.page.locator(f'[role="slider"][aria-valuemin="{smallest}"][aria-valuemax="{largest}"]')
         thumb.scroll_into_view_if_needed()
         box = thumb.bounding_box()
         track = thumb.locator("xpath=..").bounding_box()
@@ -148,17 +210,54 @@ class Page:
         return names
 
 
-def screenshot(config, target):
-    """The whole page of `ns-viewer` on the run of `config`, as the viewer shows it first."""
-    with sync_playwright() as playwright, Viewer(config, Path(target).with_suffix(".log")) as viewer:
+def away(page):
+    """No tooltip, and the whole panel."""
+    page.page.mouse.move(WINDOW["width"] / 3, 30)
+    page.page.get_by_text("Drawn", exact=True).scroll_into_view_if_needed()
+    page.page.wait_for_timeout(3000)
+
+
+def screenshots(config, folder, closer):
+    """Pages of `ns-viewer` on a run of several levels, `viewer_*.png`: as it starts, and with each control in use.
+
+    The camera is that of a photograph, moved closer by so many turns of the wheel.
+    """
+    with sync_playwright() as playwright, Viewer(config, folder / "viewer.log") as viewer:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         page = Page(browser, viewer.port)
-        count = wait_until(page.drawn, "a picture")[0]
-        page.settled(count)
-        page.page.get_by_text("Level of detail", exact=True).scroll_into_view_if_needed()
-        page.page.screenshot(path=target)
+        wait_until(page.drawn, "a picture")
+        page.take_a_photographs_place()
+        page.press("Hide Train Cams")
+        page.page.mouse.move(WINDOW["width"] / 3, WINDOW["height"] / 2)
+        for _ in range(closer):
+            page.page.mouse.wheel(0, -200)
+            page.page.wait_for_timeout(300)
+
+        def shoot(name):
+            away(page)
+            picture = Image.open(io.BytesIO(page.page.screenshot())).convert("RGB")
+            # few colours: small files
+            picture.quantize(256, kmeans=3).save(folder / f"viewer_{name}.png", optimize=True)
+
+        shoot("prefix")
+        page.choose("Mode", "band")
+        shoot("band")
+        page.choose("Mode", "budget")
+        page.enter("Budget (thousands)", 10)
+        shoot("budget")
+        page.choose("Mode", "prefix")
+        page.choose("Gaze", "click")
+        page.place(0.48, 0.5)
+        shoot("gaze")
+        page.choose("Gaze", "off")
+        page.choose("Filter", "xray")
+        shoot("filter")
+        page.choose("Filter", "off")
+        page.choose("Focus", "click")
+        page.place(0.48, 0.5)
+        shoot("focus")
         browser.close()
 
 
 if __name__ == "__main__":
-    screenshot(Path(sys.argv[1]), Path(sys.argv[2]))
+    screenshots(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) > 3 else 0)

@@ -438,19 +438,19 @@ class TestPictures:
             return in_render_thread(lambda: dict(model.get_outputs_for_camera(camera)))
 
         before = model.get_outputs_for_camera(camera)
-        model.detail.value = 3.0
+        model.controls.slider.value = 3.0
         after = model.get_outputs_for_camera(camera)
-        assert torch.equal(before["rgb"], after["rgb"]) and model.drawn.value == "-"
+        assert torch.equal(before["rgb"], after["rgb"]) and model.controls.drawn.value == "-"
         seen = shown()
         assert torch.equal(seen["rgb"], before["detail_3"])
-        drawn = int(model.drawn.value.split(" / ")[0].replace(",", ""))
+        drawn = int(model.controls.drawn.value.split(" / ")[0].replace(",", ""))
         assert 0 < drawn < model.num_points
         assert not torch.equal(seen["drawn_share"], before["drawn_share"])
-        model.detail.value = 1.0
+        model.controls.slider.value = 1.0
         full = shown()
         assert torch.equal(full["rgb"], before["rgb"])
         assert float((full["drawn_share"] - 1).abs()[full["accumulation"] > 0.5].max()) < 1e-3
-        model.detail.value = 10.0
+        model.controls.slider.value = 10.0
         assert torch.equal(shown()["detail_2"], before["detail_2"])
 
     def test_the_view_does_not_pop(self, trainer):

@@ -52,24 +52,26 @@ def test_the_slider_acts_in_the_viewer_alone(trainer):
     camera, batch = view(trainer)
     with torch.no_grad():
         before = model.get_outputs_for_camera(camera)["rgb"]
-        model.lod.value = 1.0
+        model.controls.slider.value = 1.0
         after = model.get_outputs_for_camera(camera)
         assert torch.equal(after["rgb"], before)
         metrics, _ = model.get_image_metrics_and_images(after, batch)
         assert metrics["gaussians"] == model.num_points
-        assert model.drawn.value == "-"
+        assert model.controls.drawn.value == "-"
 
         shown = in_render_thread(lambda: model.get_outputs_for_camera(camera)["rgb"])
         assert torch.equal(shown, after["prefix_1"])
         assert not torch.equal(shown, before)
         base, everything = model.level_counts()[0], model.num_points
-        assert model.drawn.value.startswith(f"{base:,} / {everything:,}, ") and model.drawn.value.endswith(" ms")
+        assert model.controls.drawn.value.startswith(
+            f"{base:,} / {everything:,}, "
+        ) and model.controls.drawn.value.endswith(" ms")
 
-        model.lod.value = 3.0
+        model.controls.slider.value = 3.0
         assert torch.equal(in_render_thread(lambda: model.get_outputs_for_camera(camera)["rgb"]), before)
-        assert model.drawn.value.startswith(f"{everything:,} / {everything:,}, ")
+        assert model.controls.drawn.value.startswith(f"{everything:,} / {everything:,}, ")
 
-        model.lod.value = 2.5
+        model.controls.slider.value = 2.5
         between = in_render_thread(lambda: model.get_outputs_for_camera(camera)["rgb"])
         assert not torch.equal(between, before) and not torch.equal(between, after["prefix_2"])
 
@@ -81,22 +83,22 @@ def test_a_budget_bounds_what_the_viewer_draws(trainer):
 
     def drawn():
         picture = in_render_thread(lambda: model.get_outputs_for_camera(camera)["rgb"])
-        return int(model.drawn.value.split(" / ")[0].replace(",", "")), picture
+        return int(model.controls.drawn.value.split(" / ")[0].replace(",", "")), picture
 
     with torch.no_grad():
         everything, full = drawn()
         seen = int(in_view(model.gaussians(), to_camera(camera)).sum())
-        model.budget.value = 1e6
+        model.controls.mode.value, model.controls.budget.value = "budget", 1e6
         assert drawn()[0] == seen <= everything
         torch.testing.assert_close(drawn()[1], full)
         for thousands in (0.05, 0.2):
-            model.budget.value = thousands
+            model.controls.budget.value = thousands
             assert drawn()[0] == round(1000 * thousands) and not torch.equal(drawn()[1], full)
         # the slider's prefix is cut down, too
-        model.budget.value, model.lod.value = 1e6, 1.0
+        model.controls.budget.value, model.controls.slider.value = 1e6, 1.0
         base = drawn()[0]
         assert base < seen
-        model.budget.value = (base - 7) / 1000
+        model.controls.budget.value = (base - 7) / 1000
         assert drawn()[0] == base - 7
         assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], full)
 
@@ -107,8 +109,11 @@ def test_training_does_not_see_the_controls(trainer):
     camera, _ = trainer.pipeline.datamanager.next_train(0)
     trainer.pipeline.train()
     pictures = []
-    for value in (3.0, 1.0):
-        model.lod.value, model.budget.value = value, 0.01 if value == 1 else 0.0
+    controls = model.controls
+    for touched in (False, True):
+        if touched:
+            controls.mode.value, controls.slider.value, controls.budget.value = "budget", 1.0, 0.01
+            controls.gaze.value, controls.filter.value = "middle", "xray"
         torch.manual_seed(0)
         pictures.append([p.detach() for p in model.get_outputs(camera)["prefixes"]])
     assert len(pictures[0]) == 3
@@ -118,7 +123,7 @@ def test_training_does_not_see_the_controls(trainer):
 def test_the_viewer_finds_the_controls_without_side_effects(trainer):
     """It reads every public attribute of the model; none may raise, even where the export is refused."""
     found = parse_object(trainer.pipeline, ViewerElement, "Custom Elements")
-    assert {element.name for _, element in found} == {"Level of detail", "Budget (thousands)", "Drawn"}
+    assert [element for _, element in found] == [trainer.pipeline.model.controls]
     assert all(path.count("/") == 2 for path, _ in found)
 
 
@@ -143,11 +148,11 @@ class Server:
 def test_writing_the_count_asks_for_no_new_picture(trainer):
     """viser calls an input's hooks when the program writes it, and nerfstudio's hook renders."""
     server = Server()
-    trainer.pipeline.model.drawn.install(server)
+    trainer.pipeline.model.controls.drawn.install(server)
     assert server.hooks == []
-    trainer.pipeline.model.drawn.value = "5 / 5, 1 ms"
+    trainer.pipeline.model.controls.drawn.value = "5 / 5, 1 ms"
     assert server.value == "5 / 5, 1 ms"
-    trainer.pipeline.model.lod.install(server)
+    trainer.pipeline.model.controls.slider.install(server)
     assert len(server.hooks) == 1
 
 

@@ -277,18 +277,19 @@ def test_the_viewers_budget_with_decays_and_before(plain, start):
 
     def drawn():
         picture = in_render_thread(lambda: model.get_outputs_for_camera(camera)["rgb"])
-        return int(model.drawn.value.split(" / ")[0].replace(",", "")), picture
+        return int(model.controls.drawn.value.split(" / ")[0].replace(",", "")), picture
 
+    model.controls.mode.value = "budget"
     with torch.no_grad():
         seen = int(in_view(model.gaussians(), to_camera(camera)).sum())
         for decays in (False, True):
-            model._decays, model.budget.value = decays, 0.0
+            model._decays, model.controls.budget.value = decays, 0.0
             everything, full = drawn()
-            model.budget.value = 1e6
+            model.controls.budget.value = 1e6
             assert drawn()[0] <= seen
             torch.testing.assert_close(drawn()[1], full)
-            model.budget.value = 0.03
+            model.controls.budget.value = 0.03
             assert drawn()[0] == 30 and not torch.equal(drawn()[1], full)
         # what the slider leaves is within the budget already
-        model.budget.value, model.detail.value = 1e6, 10.0
+        model.controls.budget.value, model.controls.slider.value = 1e6, 10.0
         assert drawn()[0] < everything

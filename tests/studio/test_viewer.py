@@ -57,6 +57,119 @@ def test_level_of_detail_in_a_browser(trained, chromium, tmp_path):
     assert "Traceback" not in log, log
 
 
+SAME = 1.2
+"""mean difference of two screenshots of one view, in 0..255, that compression alone may make"""
+
+
+def still(page):
+    """The picture, once it is drawn at full size and stays."""
+    found = [page.look()]
+
+    def again():
+        page.page.wait_for_timeout(500)
+        found.append(page.look())
+        return np.array_equal(*found[-2:])
+
+    wait_until(again, "a picture that stays")
+    return found[-1]
+
+
+def until_it_changes(page, before):
+    """The picture, once it is another one."""
+    wait_until(lambda: difference(before, page.look()) > SAME, "another picture")
+    return still(page)
+
+
+def test_each_control_in_a_browser(trained, chromium, tmp_path):
+    checkpoint = torch.load(trained.parent / "nerfstudio_models" / f"step-{STEPS - 1:09d}.ckpt", map_location="cpu")
+    counts = torch.bincount(checkpoint["pipeline"]["_model.level"].long())[1:].cumsum(0).tolist()
+    with Viewer(trained, tmp_path / "viewer.log") as viewer:
+        page = Page(chromium, viewer.port)
+        page.settled(counts[2])
+        page.press("Hide Train Cams")
+        full = still(page)
+
+        assert not any(map(page.shows, ("Budget (thousands)", "Gaze radius", "Focus radius", "Move the gaze")))
+        use_modes(page, counts, full)
+        use_gaze(page, counts)
+        use_filters(page, counts)
+        use_focus(page, counts)
+        page.choose("Focus", "off")
+        wait_until(lambda: page.drawn()[0] == counts[2], "everything")
+        page.page.close()
+    log = (tmp_path / "viewer.log").read_text()
+    assert "Traceback" not in log, log
+
+
+def use_modes(page, counts, full):
+    page.choose("Mode", "band")
+    band = until_it_changes(page, full)
+    assert band.std() < full.std(), "a band is mostly grey"
+    assert page.slide(0.0) == 1.0
+    wait_until(lambda: page.drawn()[0] == counts[0], "the base")
+    page.choose("Mode", "all")
+    wait_until(lambda: page.drawn()[0] == counts[2], "everything")
+    wait_until(lambda: difference(full, page.look()) < SAME, "the full picture")
+    assert not page.shows("Level of detail")
+    page.choose("Mode", "budget")
+    wait_until(lambda: page.shows("Budget (thousands)"), "the budget's field")
+    assert page.slide(1.0) == 3.0
+    page.enter("Budget (thousands)", 0.3)
+    wait_until(lambda: page.drawn()[0] == 300, "300 Gaussians")
+    assert "The budget of 300 is below level 1" in page.note()
+    page.enter("Budget (thousands)", -1)
+    wait_until(lambda: "The last stays: 300 Gaussians." in page.note(), "a message")
+    assert page.drawn()[0] == 300
+    page.choose("Mode", "prefix")
+    wait_until(lambda: page.drawn()[0] == counts[2], "everything")
+    assert "udget" not in page.note()
+
+
+def use_gaze(page, counts):
+    before = still(page)
+    page.choose("Gaze", "middle")
+    wait_until(lambda: counts[0] <= page.drawn()[0] < counts[2], "less than everything")
+    page.choose("Gaze", "click")
+    page.place(0.1, 0.1)
+    corner = until_it_changes(page, before)
+    few = page.drawn()[0]
+    assert counts[0] <= few < counts[2]
+    page.slide(1.0, 0, 0.5)
+    wait_until(lambda: page.drawn()[0] > few, "a larger gaze")
+    page.slide(0.2, 0, 0.5)
+    page.press("Move the gaze")
+    page.place(0.4, 0.7)
+    moved = until_it_changes(page, corner)
+    # and then the picture can be dragged again
+    page.drag(40, 0)
+    until_it_changes(page, moved)
+    page.choose("Gaze", "off")
+    wait_until(lambda: page.drawn()[0] == counts[2], "everything")
+
+
+def use_filters(page, counts):
+    before = still(page)
+    pictures = []
+    for name in ("xray", "brush", "sharp"):
+        page.choose("Filter", name)
+        pictures.append(until_it_changes(page, pictures[-1] if pictures else before))
+        assert difference(before, pictures[-1]) > SAME
+    wait_until(lambda: page.drawn()[0] == counts[0] + counts[2] - counts[1], "what is not of level 2")
+    page.choose("Filter", "off")
+    wait_until(lambda: difference(before, page.look()) < SAME, "the plain picture")
+
+
+def use_focus(page, counts):
+    before = still(page)
+    page.choose("Focus", "click")
+    page.place(0.4, 0.7)
+    until_it_changes(page, before)
+    few = page.drawn()[0]
+    assert counts[0] <= few < counts[2]
+    page.slide(1.0, 0.02, 1)
+    wait_until(lambda: page.drawn()[0] > few, "a larger focus")
+
+
 def test_detail_scale_in_a_browser(faded, chromium, tmp_path):
     with Viewer(faded, tmp_path / "viewer.log") as viewer:
         page = Page(chromium, viewer.port, "Detail scale", 10)
