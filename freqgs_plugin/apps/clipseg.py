@@ -74,12 +74,12 @@ def _classes() -> tuple[Any, Any]:
 def _missing(weights: str | Path, allow_download: bool) -> str:
     if Path(weights).is_dir():
         return (
-            f"the folder {weights} holds no complete CLIPSeg model; it needs what `save_pretrained` of the model and of "
-            "its processor write: config.json, model.safetensors, the image processor's and the tokenizer's files."
+            f"the folder {weights} holds no complete CLIPSeg model; it needs what `save_pretrained` of the model and "
+            "of its processor write: config.json, model.safetensors, the image processor's and the tokenizer's files."
         )
     if allow_download:
         return f"the CLIPSeg weights '{weights}' could not be downloaded; check the name and the network."
     return (
-        f"the CLIPSeg weights '{weights}' are neither a folder nor in the cache of the Hugging Face hub, and nothing is "
-        "downloaded unasked. Pass weights=FOLDER with a saved model, or allow_download=True to fetch them once."
+        f"the CLIPSeg weights '{weights}' are neither a folder nor in the cache of the Hugging Face hub, and nothing "
+        "is downloaded unasked. Pass weights=FOLDER with a saved model, or allow_download=True to fetch them once."
     )
