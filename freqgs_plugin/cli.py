@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
+from freqgs_plugin.demo.benches import BENCHES as DEMO_BENCHES
 from freqgs_plugin.demo.experiments import EXPERIMENTS
 from freqgs_plugin.reports.bench.commands import BENCHES
 
@@ -72,7 +73,7 @@ def stability(
 COMMANDS = {
     "demo": demo,
     "stability": stability,
-    "bench": BENCHES,
+    "bench": {**BENCHES, **DEMO_BENCHES},
     "experiment": EXPERIMENTS,
 }
 """name on the command line -> function, whose signature and docstring become the options and the help, or -> a table of
