@@ -47,16 +47,9 @@ def propagate(
 ) -> tuple[Selection, list[Bool[Tensor, "_ _"]]]:
     """The object's Gaussians by the votes of all views, and its mask in each.
 
-    Args:
-        gaussians: the scene.
-        cameras: of the views.
-        images: their photographs, RGB in [0, 1].
-        first: index of the view whose mask is known; it is kept as it is.
-        mask: the object there.
-        rasterizer: what composites; any backend.
-        antialiased: as the scene was trained.
-        attenuation: the scene is seen under; None: everything is drawn.
-        rounds: how often all masks are made again once every view has voted; 0 is quicker.
+    `images` are the views' photographs, RGB in [0, 1], and `mask` is the object in view `first`, which is kept as it
+    is. In each of `rounds`, all other masks are made again from the votes of all views. Further arguments are those of
+    `vote`.
 
     Raises:
         MaskError: the mask is empty, images or mask are of another number or size than the views, or no Gaussian lies
@@ -68,12 +61,13 @@ def propagate(
     start = view_weights(gaussians, cameras[first], mask, **drawing)
     if not bool(elected(start).rows.any()):
         raise MaskError("no Gaussian belongs to what the mask marks; mark something that the scene shows there.")
-    order = _order(gaussians, cameras, first, elected(start).rows)
     masks: dict[int, Tensor] = {first: mask}
+    order = _order(gaussians, cameras, first, elected(start).rows)
     weights = start
     for repeat in range(rounds + 1):
         before, weights = weights, start.clone()
         for i in order:
+            # in the first round, of the views that are done; then of all of them in the round before
             votes = weights if repeat == 0 else before
             masks[i] = _mask(gaussians, cameras[i], images[i], votes, drawing)
             weights += view_weights(gaussians, cameras[i], masks[i], **drawing)

@@ -7,7 +7,8 @@ import numpy as np
 from freqgs_plugin.reports.bench.focus_cases import BOX_MARGIN, FocusSubject, Outcome, outcomes
 from freqgs_plugin.reports.bench.options import BenchOptions
 from freqgs_plugin.reports.bench.runner import Bench, Measured, Tick
-from freqgs_plugin.reports.bench.tables import BenchTable, Row, number
+from freqgs_plugin.reports.bench.tables import BenchTable, Row, milliseconds, number
+from freqgs_plugin.reports.timing import timing_of
 
 FEW = 4
 """views that vote in the ways called so"""
@@ -67,18 +68,16 @@ def time_table(rows: Sequence[Row], subject: FocusSubject) -> BenchTable:
         "box": f"`mask_from_box`, `propagate` to {views} views",
         "point": f"`mask_from_point`, `propagate` to {views} views",
     }
-    times = [{"way": text, "seconds": [row[way].seconds for row in rows]} for way, text in ways.items()]
+    times = [{"way": text, "time": timing_of([1000 * row[way].seconds for row in rows])} for way, text in ways.items()]
     return BenchTable(
         "focus-times",
         "Time for one object",
         times,
         [
             ("way", lambda row: row["way"]),
-            ("median, s", lambda row: number(float(np.median(row["seconds"])))),
-            ("least, s", lambda row: number(min(row["seconds"]))),
-            ("most, s", lambda row: number(max(row["seconds"]))),
+            ("time, ms", lambda row: milliseconds(row["time"])),
         ],
-        f"Over the {len(rows)} objects of the table before, each selected once.",
+        f"Median (quartiles) over the {len(rows)} objects of the table before, each selected once.",
     )
 
 
