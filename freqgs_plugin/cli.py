@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Union
 from tyro.conf import arg
 
 from freqgs_plugin.commands.options import CommandError, RenderOptions
+from freqgs_plugin.demo.benches import BENCHES as DEMO_BENCHES
 from freqgs_plugin.demo.experiments import EXPERIMENTS
 from freqgs_plugin.reports.bench.commands import BENCHES
 
@@ -88,7 +89,7 @@ COMMANDS = {
     "demo": demo,
     "render": render,
     "stability": stability,
-    "bench": BENCHES,
+    "bench": {**BENCHES, **DEMO_BENCHES},
     "experiment": EXPERIMENTS,
 }
 """name on the command line -> function, whose signature and docstring become the options and the help, or -> a table of

@@ -11,7 +11,7 @@ from torch import Tensor
 from freqgs_plugin.io.parameters import RawGaussians
 from freqgs_plugin.io.ply import read_ply
 from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
-from freqgs_plugin.reports.bench.trained import load, quiet
+from freqgs_plugin.reports.bench.trained import load, views_of_split
 from freqgs_plugin.types import Camera, Gaussians
 
 
@@ -93,8 +93,7 @@ def shots(scene: Scene, path: Path | None, split: Literal["test", "train"], size
     elif scene.run is None:
         raise ValueError("a PLY has no cameras: give --path FILE (saved in the viewer), or --load-config of its run.")
     else:
-        with quiet():
-            views = scene.run.cameras(split)
+        views = views_of_split(scene.run, split)
         if not views:
             raise ValueError(f"the run has no views in the split '{split}'; choose the other one, or give --path.")
         shot = Shot([view.camera for view in views], [Path(view.name).stem for view in views])

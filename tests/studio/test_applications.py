@@ -13,11 +13,14 @@ def test_the_code_on_the_page_runs(trained, tmp_path, monkeypatch, capsys):
     (tmp_path / "RUN").symlink_to(trained.parent, target_is_directory=True)
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.S)
-    assert len(blocks) == 5
+    assert len(blocks) == 7
     names = {}
     for block in blocks:
         exec(compile(block, str(PAGE), "exec"), names)
     assert (tmp_path / "level-1.png").stat().st_size > 0
-    assert re.search(r"^[\d,]+ of [\d,]+ Gaussians$", capsys.readouterr().out, flags=re.M)
+    out = capsys.readouterr().out
+    assert re.search(r"^[\d,]+ of [\d,]+ Gaussians$", out, flags=re.M)
+    assert re.search(r"^[1-9]\d* Gaussians, \d+ pixels of this view$", out, flags=re.M)
+    assert re.search(r"^kept [1-9]\d* Gaussians: the mask is empty", out, flags=re.M)
     assert names["picture"].features.shape[:2] == (names["camera"].height, names["camera"].width)
     assert names["distance"].min() >= 0 and (names["run"].gaussians.level[names["row"]] == 1).all()

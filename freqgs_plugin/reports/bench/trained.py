@@ -37,6 +37,12 @@ def views_of(run: Any) -> list[Any]:
         return run.cameras("test") or run.cameras("train")
 
 
+def views_of_split(run: Any, split: str) -> list[Any]:
+    """The views of `train` or `test`."""
+    with quiet():
+        return run.cameras(split)
+
+
 @contextmanager
 def quiet() -> Iterator[None]:
     """What nerfstudio has to say goes nowhere."""
