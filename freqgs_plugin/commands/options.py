@@ -37,6 +37,13 @@ class RenderOptions:
     """of the disc without loss, share of the longer side"""
     gaze_sigma: float = 0.1
     """how fast detail falls off beyond, share of the longer side"""
+    focus: str | None = None
+    """all levels for one object: a folder of masks, VIEW:left,top,right,bottom or VIEW:x,y (pixels, grown by GrabCut),
+    or text:PROMPT (needs the extra `prompt`)"""
+    focus_outside: int = 1
+    """levels that are drawn outside of the object; 0: the object alone"""
+    segmenter_weights: Path | None = None
+    """folder with CLIPSeg's weights for --focus text:...; without it the Hugging Face cache"""
     filter: Literal["none", "xray", "brush", "sharp"] = "none"
     """artistic filter by level"""
     video: Literal["paths", "always", "never"] = "paths"

@@ -12,6 +12,8 @@ from freqgs_plugin.apps.amount import Amount, parse_amount
 from freqgs_plugin.apps.filters import apply_filter
 from freqgs_plugin.apps.foveation import Foveation
 from freqgs_plugin.apps.gaze import Point, gaze_points, salient_point
+from freqgs_plugin.apps.segmenters import SegmenterError
+from freqgs_plugin.commands.focusing import focus_on
 from freqgs_plugin.commands.frames import FrameFolder, FrameRecord, write_video
 from freqgs_plugin.commands.options import CommandError, RenderOptions
 from freqgs_plugin.commands.scene import Scene, Shot, open_scene, shots
@@ -48,7 +50,7 @@ def run_render(options: RenderOptions, console: "Console") -> None:
         rate = _rate(options, shot)
         look = _look(options, amount, scene, shot, console)
         folder = FrameFolder(options.output_dir, _settings(options))
-    except ValueError as error:
+    except (ValueError, SegmenterError) as error:
         raise CommandError(str(error)) from error
     _draw_all(options, scene, shot, gazes, look, folder, console)
     if rate is not None:
@@ -93,6 +95,11 @@ def _settings(options: RenderOptions) -> dict[str, Any]:
 def _look(options: RenderOptions, amount: Amount | None, scene: Scene, shot: Shot, console: "Console") -> Look:
     gaussians = scene.gaussians if options.filter == "none" else apply_filter(scene.gaussians, options.filter)
     parts: list[Attenuation] = []
+    if options.focus is not None:
+        shown = replace(scene, gaussians=gaussians)
+        focus, found = focus_on(shown, options.focus, options.focus_outside, options.segmenter_weights)
+        console.print(f"focus on {found.count:,} of {len(gaussians):,} Gaussians")
+        parts.append(focus)
     if options.level is not None:
         parts.append(LevelCut(options.level))
     decays = gaussians.decay is not None

@@ -105,7 +105,7 @@ def rendered_weight(
     Summed over all prefixes that it belongs to, too, so that the base is not judged by what covers it. Occlusion
     counts: the gradient of a picture of ones with respect to a feature of each Gaussian is just this sum.
     """
-    probe = torch.zeros(len(gaussians), 1, device=gaussians.means.device, requires_grad=True)
+    probe = gaussians.means.new_zeros(len(gaussians), 1).requires_grad_()
     weight = 1.0 if attenuation is None else attenuation(gaussians, camera).detach()
     splats = Splats(
         gaussians.means.detach(),

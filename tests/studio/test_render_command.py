@@ -7,7 +7,7 @@ import pytest
 import torch
 from running import SIZE, command
 
-from freqgs_plugin.io.images import read_image, to_uint8
+from freqgs_plugin.io.images import read_image, to_uint8, write_image
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.ply import write_ply
 from freqgs_plugin.studio.checkpoint import load_run
@@ -106,6 +106,25 @@ def test_a_ply_along_a_path(trained, tmp_path):
     assert {r["drawn"] for r in frames(tmp_path / "out").values()} == {int(rows.sum())}
 
 
+def test_focus_from_masks_and_from_a_box(trained, tmp_path):
+    run = load_run(trained)
+    base = int((run.gaussians.level == 1).sum())
+    (tmp_path / "masks").mkdir()
+    for view in run.cameras("test"):
+        mask = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+        mask[20:50, 20:60] = 255
+        write_image(tmp_path / "masks" / f"{view.name.rsplit('.', 1)[0]}.png", mask)
+    done = render("--load-config", trained, "--focus", tmp_path / "masks", "--output-dir", tmp_path / "masked")
+    assert done.code == 0 and "focus on" in done.text, str(done)
+    drawn = {r["drawn"] for r in frames(tmp_path / "masked").values()}
+    assert all(base < count < len(run.gaussians) for count in drawn)
+    view = run.cameras("train")[0].name.rsplit(".", 1)[0]
+    alone = ["--focus", f"{view}:20,12,60,52", "--focus-outside", 0, "--output-dir", tmp_path / "alone"]
+    done = render("--load-config", trained, *alone)
+    assert done.code == 0, str(done)
+    assert all(0 < r["drawn"] < base for r in frames(tmp_path / "alone").values())
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -120,6 +139,11 @@ def test_a_ply_along_a_path(trained, tmp_path):
         (("--load-config", "RUN", "--fps", "0"), "fps is 0"),
         (("--load-config", "RUN", "--path", "nowhere.json"), "nowhere.json is no file"),
         (("--load-config", "RUN", "--path", "RUN"), "is no camera path"),
+        (("--load-config", "RUN", "--focus", "nowhere"), "nowhere is no folder"),
+        (("--load-config", "RUN", "--focus", "nowhere:1,2"), "the view 'nowhere'"),
+        (("--load-config", "RUN", "--focus", "view_001:1,2,3"), "3 numbers"),
+        (("--load-config", "RUN", "--focus", "view_001:900,2"), "lies outside of the 80x64 image"),
+        (("--load-config", "RUN", "--focus", "text:ball", "--segmenter-weights", "nowhere"), "nowhere"),
     ],
 )
 def test_what_cannot_be_drawn_is_said(trained, tmp_path, monkeypatch, capsys, arguments, message):
