@@ -452,6 +452,8 @@ class TestPictures:
         assert float((full["drawn_share"] - 1).abs()[full["accumulation"] > 0.5].max()) < 1e-3
         model.controls.slider.value = 10.0
         assert torch.equal(shown()["detail_2"], before["detail_2"])
+        model.controls.mode.value = "all"
+        assert torch.equal(shown()["rgb"], before["rgb"])
 
     def test_the_view_does_not_pop(self, trainer):
         """A hundredth more scale changes the picture by as little everywhere, although Gaussians vanish."""
