@@ -195,7 +195,14 @@ def test_dependencies_are_what_is_imported():
         r"^dependencies = \[\n(.*?)^\]", (ROOT / "pyproject.toml").read_text("utf-8"), flags=re.M | re.S
     )
     declared = set(re.findall(r'^    "([\w-]+)', block, flags=re.MULTILINE))
-    assert imported - declared == set(), "imported, not declared"
+    project = (ROOT / "pyproject.toml").read_text("utf-8")
+    (extra,) = re.findall(r"^prompt = \[(.*?)\]", project, flags=re.MULTILINE)
+    optional = set(re.findall(r'"([\w-]+)', extra))
+    assert optional == {"transformers"} and imported - declared == optional, "imported, not declared"
+    where = [
+        p.name for p in sources if re.search(r"^\s*(?:import|from) transformers", p.read_text("utf-8"), re.MULTILINE)
+    ]
+    assert where == ["clipseg.py"], "nothing else may need an extra"
     # loaded by path
     assert declared - imported == {"tbb"}, "declared, not imported"
 
