@@ -74,6 +74,18 @@ def test_weights_add_up_to_what_is_covered(rasterizer, assert_close):
     assert (weight >= 0).all()
 
 
+def test_weights_in_float64(assert_close):
+    g = gaussians()
+    fields = {
+        name: value.double() for name, value in vars(g).items() if torch.is_tensor(value) and value.is_floating_point()
+    }
+    camera = replace(CAMERA, viewmat=CAMERA.viewmat.double(), K=CAMERA.K.double())
+    reference = TorchRasterizer()
+    weight = rendered_weight(replace(g, **fields), camera, 1, rasterizer=reference)
+    assert weight.dtype == torch.float64
+    assert_close(rendered_weight(g, CAMERA, 1, rasterizer=reference), weight, loosen=10)
+
+
 def test_weights_count_every_prefix(rasterizer, assert_close):
     g = gaussians()
     expected = torch.zeros(len(g))
