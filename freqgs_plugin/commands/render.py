@@ -43,7 +43,7 @@ def run_render(options: RenderOptions, console: "Console") -> None:
         OSError: inputs that are not there, or an output folder that cannot be used.
     """
     try:
-        amount = None if options.budget is None else parse_amount(options.budget)
+        amount = _check(options)
         scene = open_scene(options.load_config, options.ply, options.rasterizer)
         shot = shots(scene, options.path, options.split, options.size)
         gazes = _gazes(options, len(shot.cameras))
@@ -59,19 +59,28 @@ def run_render(options: RenderOptions, console: "Console") -> None:
         console.print(str(path), soft_wrap=True)
 
 
+def _check(options: RenderOptions) -> Amount | None:
+    """Refuse what makes no sense for any scene, before one is loaded; the budget."""
+    if options.level is not None:
+        LevelCut(options.level)
+    if options.size is not None and min(options.size) < 1:
+        raise ValueError(f"size is {options.size[0]}x{options.size[1]}; both must be at least 1 px.")
+    if options.fps is not None and not 0 < options.fps <= 1000:
+        raise ValueError(f"fps is {options.fps:g}; give frames per second above 0, up to 1000.")
+    if options.gaze is not None:
+        Foveation((0.5, 0.5), options.gaze_sigma, options.gaze_radius)
+        if not Path(options.gaze).is_file():
+            gaze_points(options.gaze, 1)
+    return None if options.budget is None else parse_amount(options.budget)
+
+
 def _gazes(options: RenderOptions, frames: int) -> list[Point | None]:
-    if options.gaze is None:
-        return [None] * frames
-    # refuses other numbers before anything is drawn
-    Foveation((0.5, 0.5), options.gaze_sigma, options.gaze_radius)
-    return gaze_points(options.gaze, frames)
+    return [None] * frames if options.gaze is None else gaze_points(options.gaze, frames)
 
 
 def _rate(options: RenderOptions, shot: Shot) -> float | None:
     """Frames per second of the video; None without one."""
     rate = options.fps if options.fps is not None else (shot.fps or 24.0)
-    if not 0 < rate <= 1000:
-        raise ValueError(f"fps is {rate:g}; give frames per second above 0, up to 1000.")
     if options.video == "never" or (options.video == "paths" and shot.fps is None):
         return None
     sizes = sorted({(camera.width, camera.height) for camera in shot.cameras})

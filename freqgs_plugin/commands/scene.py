@@ -83,7 +83,7 @@ def shots(scene: Scene, path: Path | None, split: Literal["test", "train"], size
     """The views of `path`, a camera path of nerfstudio's viewer, or of the run's split; at `size` (w, h) if given.
 
     Raises:
-        ValueError: a file alone without a path, no views in the split, or a size under 1 px.
+        ValueError: a file alone without a path, or no views in the split.
     """
     if path is not None:
         from freqgs_plugin.studio.camera_path import read_camera_path
@@ -103,13 +103,7 @@ def shots(scene: Scene, path: Path | None, split: Literal["test", "train"], size
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """The same field of view along the wider side, square pixels, at `width` x `height` px.
-
-    Raises:
-        ValueError: a size under 1 px.
-    """
-    if min(width, height) < 1:
-        raise ValueError(f"size is {width}x{height}; both must be at least 1 px.")
+    """The same field of view across, square pixels, at `width` x `height` px."""
     factor = width / camera.width
     K = camera.K.clone()
     K[:2] *= factor
