@@ -23,12 +23,12 @@ Reference = Literal["frustum_max", "frustum_quantile", "scene"]
 """what distances are divided by: the largest distance of a Gaussian in the frustum (the paper), the 0.99 quantile of
 those distances, or one number that belongs to the scene and does not change with the view"""
 _QUANTILE = 0.99
-_LEAST_OPACITY = 1e-30
-_LARGEST_DECAY = 1e15
-_FARTHEST = 1e18
-_FAINTEST = -85.0
+LEAST_OPACITY = 1e-30
+LARGEST_DECAY = 1e15
+FARTHEST = 1e18
+FAINTEST = -85.0
 """least exponent that is taken: exp of it is about the least normal number of float32"""
-_FADED = 100.0
+FADED = 100.0
 """a distance of more than this many sqrt(2) sigma counts as this many: exp(-1e4) is 0 in every dtype"""
 
 
@@ -109,11 +109,16 @@ class DistanceDecay:
         _check_reference(self.reference, self.scene_distance)
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Float[Tensor, " n"]:
+        if self.reference == "scene" and self.scene_distance is not None and _for_viewing(gaussians):
+            from freqgs_plugin.functional import compiled_attenuation
+
+            parts = gaussians.means, exact_centre(camera), gaussians.opacities, decay_of(gaussians)
+            return compiled_attenuation.weights(*parts, float(self.scale), float(self.scene_distance), self.soft)
         distance = normalised_distance(gaussians, camera, self.reference, self.scene_distance)
         exponent = log_decay(distance, decay_of(gaussians), self.scale)
         margin = _log_opacity(gaussians.opacities).add_(exponent).sub_(math.log(TAU * self.scale))
         # what is fainter is not drawn: numbers under 1e-38 would be a hundred times slower
-        weight = exponent.clamp_min(_FAINTEST).exp_()
+        weight = exponent.clamp_min(FAINTEST).exp_()
         if not self.soft:
             return weight * (margin > 0)
         # not expm1, which torch does not vectorise: where they differ, the fade is nothing
@@ -130,11 +135,11 @@ class DistanceDecay:
 def log_decay(distance: Float[Tensor, " n"], decay: Float[Tensor, " n"], scale: float | int) -> Float[Tensor, " n"]:
     """-(d' s)^2 / (2 max(σ, 0)^2 + ε), at least -1e4: the exponent of Eq. 2, with finite gradients for any σ."""
     distance, decay = _at_least_float32(distance), _at_least_float32(decay)
-    far = (distance * min(float(scale), _FARTHEST)).clamp_max(_FARTHEST)
+    far = (distance * min(float(scale), FARTHEST)).clamp_max(FARTHEST)
     # in place where no derivative needs what was there: each array that is not made is one that need not be fetched
-    reach = decay.clamp(0.0, _LARGEST_DECAY).square().mul_(2.0).add_(EPSILON).sqrt_()
+    reach = decay.clamp(0.0, LARGEST_DECAY).square().mul_(2.0).add_(EPSILON).sqrt_()
     # squared last: the quotient and its derivatives stay in range where the squares would not
-    return (far / reach).clamp_max(_FADED).square().neg_()
+    return (far / reach).clamp_max(FADED).square().neg_()
 
 
 def log_attenuated(
@@ -148,7 +153,7 @@ def log_attenuated(
 
 
 def _log_opacity(opacities: Tensor) -> Tensor:
-    return _at_least_float32(opacities).clamp_min(_LEAST_OPACITY).log()
+    return _at_least_float32(opacities).clamp_min(LEAST_OPACITY).log()
 
 
 def normalised_distance(
@@ -249,6 +254,14 @@ def decay_of(gaussians: Gaussians) -> Float[Tensor, " n"]:
             "every Gaussian needs one of each."
         )
     return gaussians.decay
+
+
+def _for_viewing(gaussians: Gaussians) -> bool:
+    """Whether the compiled kernel applies: float32 on the CPU, and nobody wants a gradient."""
+    taken = (gaussians.means, gaussians.opacities, decay_of(gaussians))
+    return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in taken) and not (
+        torch.is_grad_enabled() and any(t.requires_grad for t in taken[1:])
+    )
 
 
 def _at_least_float32(x: Tensor) -> Tensor:

@@ -106,6 +106,10 @@ def _scratch(size):
 def _start_light(scratch, at, tx, ty, width, height):
     """Light 1 inside the image, 'finished' outside of it."""
     across, down = width - tx * TILE, height - ty * TILE
+    if across >= TILE and down >= TILE:
+        for p in range(0, PIXELS, LANES):
+            store(scratch, at + p, lanes(_ONE))
+        return
     for start in range(0, TILE, STRIP):
         for row in range(TILE):
             p = at + _pixel(start, row)
@@ -148,6 +152,19 @@ def _finish(block, p, count, image, alpha, depth, background, with_depth, y, c):
 
 
 @njit(error_model="numpy", inline="always")
+def _leave_empty(image, alpha, depth, background, with_depth, tx, ty, width, height):
+    """Background in a tile that no Gaussian meets."""
+    first, last = tx * TILE, min(tx * TILE + TILE, width)
+    for y in range(ty * TILE, min(ty * TILE + TILE, height)):
+        for k in range(alpha.shape[0]):
+            for channel in range(3):
+                image[k, channel, y, first:last] = background[channel]
+            alpha[k, y, first:last] = _ZERO
+        if with_depth:
+            depth[y, first:last] = _ZERO
+
+
+@njit(error_model="numpy", inline="always")
 def _ask_for(pictures, tx, ty, width, height):
     """Have the lines of a tile of pictures [_, h, w] fetched while its Gaussians are blended: writing would wait."""
     for plane in range(pictures.shape[0]):
@@ -171,6 +188,9 @@ def composite(
     for t in prange(offsets.shape[0] - 1):
         ty = t // tiles_x
         tx = t - ty * tiles_x
+        if offsets[t] == offsets[t + 1]:
+            _leave_empty(image, alpha, depth, background, with_depth, tx, ty, width, height)
+            continue
         scratch = _scratch(prefixes * FORWARD_BLOCK)
         for k in range(prefixes):
             _start_light(scratch, k * FORWARD_BLOCK + LIGHT * PIXELS, tx, ty, width, height)

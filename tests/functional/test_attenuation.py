@@ -196,6 +196,29 @@ class TestDistanceDecay:
         )
         assert not weight.requires_grad
 
+    @pytest.mark.parametrize("soft", [False, True])
+    @pytest.mark.parametrize("scale", [1e-6, 1.0, 3.7, 1e3, 1e300])
+    def test_compiled_for_viewing_it_is_the_same(self, soft, scale):
+        """Without gradients a kernel does it; with one, torch."""
+        distance = [0.0, 1e-30, 1e-6, 0.1, 0.5, 0.9, 1.0, 2.0, 7.0, 1e4, 1e15, 1e30]
+        decay = [-2.0, 0.0, 1e-8, 1e-3, 0.3, 1.0, 5.0, 6e4, 3e38]
+        opacity = [0.0, 1e-38, 0.003, 0.004, 0.0079, 0.1, 0.9, 1.0, 1.5]
+        grid = torch.cartesian_prod(*map(torch.tensor, (distance, decay, opacity)))
+        scene = decaying(grid[:, 0], grid[:, 1], grid[:, 2])
+        attenuation = DistanceDecay(scale, "scene", 1.3, soft)
+        compiled = attenuation(scene, VIEW)
+        by_torch = attenuation(dataclasses.replace(scene, decay=scene.decay.clone().requires_grad_()), VIEW)
+        assert by_torch.requires_grad and not compiled.requires_grad
+        torch.testing.assert_close(compiled, by_torch.detach(), rtol=3e-5, atol=1e-6)
+        clear = attenuation.margin(scene, VIEW).abs() > 1e-5
+        assert torch.equal((compiled > 0)[clear], (by_torch > 0)[clear]) and int(clear.sum()) > 900
+
+    def test_what_is_not_a_number_is_not_drawn(self):
+        nan = float("nan")
+        scene = decaying([nan, 1.0, 1.0, 1.0], [1.0, nan, 1.0, 1.0], [0.5, 0.5, nan, 0.5])
+        weight = DistanceDecay(1.0, "scene", 1.0)(scene, VIEW)
+        assert (weight > 0).tolist()[0::2] == [False, False] and weight[3] > 0
+
     def test_autocast_changes_nothing(self):
         scene = dataclasses.replace(decaying(torch.linspace(0, 3, 50)), means=torch.randn(50, 3))
         turned = dataclasses.replace(VIEW, viewmat=torch.linalg.qr(torch.randn(4, 4))[0])
