@@ -60,7 +60,13 @@ def test_methods_are_specifications_by_their_name(entry):
 
 
 def test_registered_are_the_methods_that_train():
-    assert sorted(e.name for e in OURS) == ["clodsplat", "lapsplat"]
+    assert sorted(e.name for e in OURS) == [
+        "clodsplat",
+        "clodsplat-paper",
+        "lapsplat",
+        "lapsplat-paper",
+        "lapsplat-plain",
+    ]
     assert [e.name for e in entry_points(group="console_scripts") if e.value.startswith("freqgs_plugin")] == ["freqgs"]
 
 

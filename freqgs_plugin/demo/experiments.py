@@ -14,27 +14,48 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from freqgs_plugin.reports.experiments.options import ClodOptions, ExperimentError
+from freqgs_plugin.reports.experiments.options import ClaimsOptions, ClodOptions, ExperimentError, TrialOptions
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from freqgs_plugin.reports.experiments.lab import Tools
     from freqgs_plugin.reports.experiments.training import ExperimentScene, Training
 
-Options = Annotated[ClodOptions, tyro.conf.arg(name="")]
+ClodFlags = Annotated[ClodOptions, tyro.conf.arg(name="")]
+ClaimsFlags = Annotated[ClaimsOptions, tyro.conf.arg(name="")]
 
 
-def clod(options: Options = ClodOptions()) -> None:  # noqa: B008
+def clod(options: ClodFlags = ClodOptions()) -> None:  # noqa: B008
     """Train and measure what clodsplat is said to do: quality against count, a plain model, pops, ablations.
 
     Trains many runs, one at a time: hours for the defaults on a CPU. Whatever is finished is kept, and the same command
     goes on from there.
     """
+    from freqgs_plugin.reports.experiments.runner import run_clod
+
+    run_clod(options, *_laboratory(options))
+
+
+def claims(options: ClaimsFlags = ClaimsOptions()) -> None:  # noqa: B008
+    """Put each claim of the two papers to the test, beside a plain model: holds or not, with its figures.
+
+    Trains 20 runs for each scene and seed, one at a time: hours on a CPU. Whatever is finished is kept, and the same
+    command goes on from there.
+    """
+    from freqgs_plugin.reports.experiments.claims_runner import run_claims
+
+    run_claims(options, *_laboratory(options))
+
+
+def _laboratory(options: TrialOptions) -> tuple[list["ExperimentScene"], "Tools", "Console"]:
+    """Scenes, what touches nerfstudio, and where to speak to the user."""
     import sys
 
     from rich.console import Console
 
     from freqgs_plugin.reports.bench.runner import check_folder
     from freqgs_plugin.reports.experiments.lab import Tools
-    from freqgs_plugin.reports.experiments.runner import run_clod
 
     scenes = [scene_of(folder) for folder in options.scenes]
     check_folder(options.output_dir)
@@ -43,10 +64,10 @@ def clod(options: Options = ClodOptions()) -> None:  # noqa: B008
     runs = options.output_dir / "runs"
     tools = Tools(lambda training, name, on_step: train_run(runs, training, name, on_step), _load, method_defaults)
     # loading sends standard output to a log; what is for the user keeps going to the terminal
-    run_clod(options, scenes, tools, Console(file=sys.stdout))
+    return scenes, tools, Console(file=sys.stdout)
 
 
-EXPERIMENTS = {"clod": clod}
+EXPERIMENTS = {"clod": clod, "claims": claims}
 """name on the command line -> function"""
 
 
@@ -63,7 +84,7 @@ def scene_of(folder: Path) -> "ExperimentScene":
     return ExperimentScene(folder.name, folder, fingerprint(folder))
 
 
-def demo_scene(options: ClodOptions) -> "ExperimentScene":
+def demo_scene(options: TrialOptions) -> "ExperimentScene":
     """The demo scene, ray-traced unless it is there, with a camera that goes from 0.3 to 3.9 m."""
     from freqgs_plugin.demo.dataset import MANIFEST, SceneOptions, write_scene
     from freqgs_plugin.demo.scene import build_world, zoom_path

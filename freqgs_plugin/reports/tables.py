@@ -35,7 +35,7 @@ class PrefixRow:
     """of the first view"""
 
 
-def psnr(picture: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:
+def psnr(picture: Float[Tensor, "*pixels 3"], target: Float[Tensor, "*pixels 3"]) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1; infinite for equal pictures."""
     error = float(torch.mean((picture - target) ** 2))
     return math.inf if error == 0 else -10 * math.log10(error)

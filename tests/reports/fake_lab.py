@@ -29,6 +29,14 @@ def decaying_run(decay=2.0, n=60, views=2):
     return SimpleNamespace(**vars(run), cameras=lambda split: held_out)
 
 
+def levels_run(n=60, views=2):
+    """A `LoadedRun` of three levels, without decay."""
+    run = fake_run(levels=3, n=n)
+    run.rasterizer = get_rasterizer("numba", "cpu")
+    held_out = fake_views(views)
+    return SimpleNamespace(**vars(run), scene_distance=None, cameras=lambda split: held_out)
+
+
 class FakeTools:
     """Counts what it is asked for; `stop_at` raises `error` instead of the training of that number."""
 
@@ -51,12 +59,16 @@ class FakeTools:
     def load(self, path):
         self.loaded.append(path)
         said = json.loads(path.read_text())
-        decays = said["method"] == "clodsplat" and said.get("use_decay", True)
-        return decaying_run(said["largest_scale"] if decays else None)
+        if said["method"].startswith("lapsplat") and said.get("num_levels") != 1:
+            return levels_run()
+        decays = said["method"].startswith("clodsplat") and said.get("use_decay", True)
+        return decaying_run(said.get("largest_scale", 5.0) if decays else None)
 
     def defaults(self, method):
         ours = {"largest_scale": 5.0, "use_decay": True, "weigh_scales": True, "reg_weight": 1.0, "reg_gradient": "ste"}
-        fields = {"seed": 42, "max_gaussians": 0, **(ours if method == "clodsplat" else PLAIN)}
+        levels = {"dft_weight": 0.001, "lower_level_weight": 0.1, "signed_residuals": True}
+        more = ours if method.startswith("clodsplat") else {**PLAIN, **levels}
+        fields = {"seed": 42, "max_gaussians": 0, **more}
         return {name: repr(value) for name, value in {**fields, **self.changed}.items()}
 
     def tools(self):

@@ -364,9 +364,10 @@ def test_options_that_make_no_sense_are_refused(options, message):
 
 
 def test_the_command_line_holds_what_differs_and_no_folders(tmp_path):
-    options = ClodOptions(tmp_path, (tmp_path / "room",), False, ("curve",), steps=300, s_max=(1.0, 5.0), docs=tmp_path)
-    assert command_line(options) == "freqgs experiment clod --scenes room --no-demo --steps 300 --s-max 1 5"
-    assert command_line(ClodOptions()) == "freqgs experiment clod"
+    more = {"only": ("curve",), "steps": 300, "s_max": (1.0, 5.0), "docs": tmp_path}
+    options = ClodOptions(tmp_path, (tmp_path / "room",), False, **more)
+    assert command_line(options, "clod") == "freqgs experiment clod --scenes room --no-demo --steps 300 --s-max 1 5"
+    assert command_line(ClodOptions(), "clod") == "freqgs experiment clod"
 
 
 def test_fingerprints_follow_the_files_and_not_the_place(tmp_path):

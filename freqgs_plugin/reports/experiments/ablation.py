@@ -7,7 +7,7 @@ from freqgs_plugin.reports.bench.tables import BenchTable, Row
 from freqgs_plugin.reports.experiments.goals import Goal
 from freqgs_plugin.reports.experiments.lab import Lab, LoadedRun
 from freqgs_plugin.reports.experiments.measures import at_scale, quality
-from freqgs_plugin.reports.experiments.options import ClodOptions
+from freqgs_plugin.reports.experiments.options import TrialOptions
 from freqgs_plugin.reports.experiments.plots import COLOURS, panels
 from freqgs_plugin.reports.experiments.section import Part, Results
 from freqgs_plugin.reports.experiments.seeds import mean, shown
@@ -50,7 +50,7 @@ def trainings(trial: Trial) -> dict[str, Training]:
     return {**cells, "without decay": trial.clod(more={"use_decay": False})}
 
 
-def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
+def measure(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
     """Quality and counts of every cell at both scales."""
     return {
         name: lab.step("ablation", [training], {"scales": SCALES}, lambda t=training: at_both(lab.run(t)))

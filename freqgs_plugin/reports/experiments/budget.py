@@ -12,7 +12,7 @@ from freqgs_plugin.reports.drawing import HeldOutView
 from freqgs_plugin.reports.experiments.goals import Goal
 from freqgs_plugin.reports.experiments.lab import Lab, LoadedRun
 from freqgs_plugin.reports.experiments.measures import at_scale, quality
-from freqgs_plugin.reports.experiments.options import ClodOptions
+from freqgs_plugin.reports.experiments.options import TrialOptions
 from freqgs_plugin.reports.experiments.plots import COLOURS, GREY, panels
 from freqgs_plugin.reports.experiments.section import Part, Results
 from freqgs_plugin.reports.experiments.seeds import mean, shown
@@ -51,7 +51,7 @@ same number of Gaussians of that view.
   s_max. It tells how much of that row's gain is the choice, and how much the training."""
 
 
-def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
+def measure(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
     """Both models, loaded together."""
     clod, plain = trial.clod(), trial.plain()
     return lab.step(

@@ -7,7 +7,7 @@ from freqgs_plugin.reports.bench.tables import BenchTable, Row, number
 from freqgs_plugin.reports.drawing import TrainedRun, draw
 from freqgs_plugin.reports.experiments.lab import Lab, LoadedRun
 from freqgs_plugin.reports.experiments.measures import at_scale, quality
-from freqgs_plugin.reports.experiments.options import ClodOptions
+from freqgs_plugin.reports.experiments.options import TrialOptions
 from freqgs_plugin.reports.experiments.plots import COLOURS, GREY, panels
 from freqgs_plugin.reports.experiments.section import Part, Results
 from freqgs_plugin.reports.experiments.seeds import mean, shown
@@ -32,7 +32,7 @@ without decay (see [Methods](methods.md#one-level)) of which the most opaque Gau
 the share."""
 
 
-def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
+def measure(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
     """One series per s_max, and the plain model's."""
     series = {}
     for largest in options.s_max:

@@ -1,4 +1,4 @@
-"""What `freqgs experiment clod` can be told. Imports nothing heavy: the command line reads it."""
+"""What the experiments can be told. Imports nothing heavy: the command line reads it."""
 
 import shlex
 from dataclasses import dataclass, fields
@@ -14,26 +14,23 @@ class ExperimentError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class ClodOptions:
-    """What is trained and measured, and where the results go."""
+class TrialOptions:
+    """What every experiment can be told: scenes, the length of a run, seeds, and where the results go."""
 
-    output_dir: Path = Path("clod-out")
-    """folder for trained runs, finished steps, clod.json, clod.md and pictures; a second start goes on from there"""
+    output_dir: Path = Path("experiment-out")
+    """folder for trained runs, finished steps and results; a second start goes on from there"""
     scenes: tuple[Path, ...] = ()
     """folders of scenes, each with a COLMAP model or a transforms.json"""
     demo: bool = True
     """also the scene of `freqgs demo`, with a camera that zooms out"""
-    only: tuple[str, ...] = SECTIONS
-    """sections to run: curve, budget, pops, ablation, sigma, with spaces or commas between; others show what the
-    folder holds of them"""
     steps: int = 3000
     """training steps of every run"""
     seeds: int = 1
     """runs of each setting, with seeds 42, 43 ...; tables show mean and spread. 2 where differences are under 0.3 dB"""
     s_max: tuple[float, ...] = (1.0, 3.0, 5.0, 7.0)
-    """largest training scales of the sections curve and sigma"""
+    """largest training scales that are compared (the sections curve and sigma)"""
     frames: int = 200
-    """steps of each sweep in the section pops"""
+    """steps of each sweep in which jumps are looked for"""
     views: int = 36
     """photographs of the demo scene"""
     size: tuple[int, int] = (320, 240)
@@ -56,6 +53,20 @@ class ClodOptions:
         names = [folder.resolve().name for folder in self.scenes] + ["demo"] * self.demo
         if len(set(names)) < len(names):
             raise ExperimentError(f"scenes are told apart by the names of their folders, and these are: {names}")
+
+
+@dataclass(frozen=True)
+class ClodOptions(TrialOptions):
+    """What is trained and measured, and where the results go."""
+
+    output_dir: Path = Path("clod-out")
+    """folder for trained runs, finished steps, clod.json, clod.md and pictures; a second start goes on from there"""
+    only: tuple[str, ...] = SECTIONS
+    """sections to run: curve, budget, pops, ablation, sigma, with spaces or commas between; others show what the
+    folder holds of them"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         _ = self.sections
 
     @property
@@ -68,9 +79,18 @@ class ClodOptions:
         return tuple(name for name in SECTIONS if name in named)
 
 
-def command_line(options: ClodOptions) -> str:
+@dataclass(frozen=True)
+class ClaimsOptions(TrialOptions):
+    """What is trained and measured, and where the results go."""
+
+    output_dir: Path = Path("claims-out")
+    """folder for trained runs, finished steps, claims.json and claims.md; a second start goes on from there. A folder
+    of `freqgs experiment clod` serves as well: what it holds is not done again"""
+
+
+def command_line(options: TrialOptions, experiment: str) -> str:
     """The command that makes the same page; scenes by name, without the folders that it writes to."""
-    command = ["freqgs", "experiment", "clod"]
+    command = ["freqgs", "experiment", experiment]
     for field in fields(options):
         value: Any = getattr(options, field.name)
         if value == field.default or field.name in ("output_dir", "docs", "only", "page_only"):

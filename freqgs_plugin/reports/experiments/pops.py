@@ -14,7 +14,7 @@ from freqgs_plugin.reports.experiments.goals import Goal
 from freqgs_plugin.reports.experiments.jumps import CAMERA, DEFAULT, HELD_SCALE, PATHS, SWITCH, jumps, variants
 from freqgs_plugin.reports.experiments.lab import Lab, LoadedRun
 from freqgs_plugin.reports.experiments.measures import at_scale
-from freqgs_plugin.reports.experiments.options import ClodOptions
+from freqgs_plugin.reports.experiments.options import TrialOptions
 from freqgs_plugin.reports.experiments.plots import COLOURS, GREY, panels
 from freqgs_plugin.reports.experiments.section import Part, Results
 from freqgs_plugin.reports.experiments.seeds import mean, shown
@@ -41,7 +41,7 @@ many Gaussians as clodsplat draws at s_v = {DEFAULT_SCALE:g}.
   camera's motion."""
 
 
-def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
+def measure(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
     """All three paths."""
     clod, plain = trial.clod(), trial.plain()
 

@@ -10,7 +10,7 @@ from freqgs_plugin.reports.bench.runner import IMAGES, check_folder, png, write_
 from freqgs_plugin.reports.experiments import ablation, budget, curve, pops, sigma
 from freqgs_plugin.reports.experiments.goals import goal_table
 from freqgs_plugin.reports.experiments.lab import Lab, Missing, Tools
-from freqgs_plugin.reports.experiments.options import SECTIONS, ClodOptions, ExperimentError, command_line
+from freqgs_plugin.reports.experiments.options import SECTIONS, ClodOptions, ExperimentError, TrialOptions, command_line
 from freqgs_plugin.reports.experiments.page import Shown, markdown_page
 from freqgs_plugin.reports.experiments.progress import Bars, Silent
 from freqgs_plugin.reports.experiments.section import Part
@@ -86,12 +86,12 @@ def _report(options: ClodOptions, scenes: Sequence[ExperimentScene], finished: L
         raise ExperimentError(
             f"{options.output_dir} holds no finished section of these scenes and settings; leave out --page-only"
         )
-    files = _files(options, _record(options, finished), shown)
+    files = _files(options, record_of(options, finished, command_line(options, "clod")), shown)
     write_all(files)
     return shown, files
 
 
-def trials(options: ClodOptions, scene: ExperimentScene) -> list[Trial]:
+def trials(options: TrialOptions, scene: ExperimentScene) -> list[Trial]:
     """One per seed."""
     return [Trial(scene, options.steps, FIRST_SEED + i) for i in range(options.seeds)]
 
@@ -113,12 +113,16 @@ def collect(options: ClodOptions, scenes: Sequence[ExperimentScene], lab: Lab) -
     return shown
 
 
-def _record(options: ClodOptions, lab: Lab) -> dict[str, Any]:
+def record_of(options: TrialOptions, lab: Lab, command: str) -> dict[str, Any]:
+    """Circumstances of all steps that `lab` was asked for; options without the folders that they write to."""
     used = list(lab.used.values())
     return {
         **environment(),
-        "command": command_line(options),
-        "options": {**asdict(options), "scenes": [folder.resolve().name for folder in options.scenes]},
+        "command": command,
+        "options": {
+            **{name: value for name, value in asdict(options).items() if name not in ("output_dir", "docs")},
+            "scenes": [folder.resolve().name for folder in options.scenes],
+        },
         "seeds": [FIRST_SEED + i for i in range(options.seeds)],
         "dates": sorted({record["date"][:10] for record in used}),
         "commits": sorted({str(record["commit"]) for record in used}),
@@ -128,8 +132,6 @@ def _record(options: ClodOptions, lab: Lab) -> dict[str, Any]:
 
 def _files(options: ClodOptions, record: dict[str, Any], shown: Sequence[Shown]) -> dict[Path, bytes]:
     """Path -> contents of everything that is written."""
-    for path in ("output_dir", "docs"):
-        record["options"].pop(path)
     report = {
         **record,
         "goals": [{**asdict(goal)} for each in shown for goal in each.goals()],

@@ -7,23 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from freqgs_plugin.training.presets import PLAIN, Value
 from freqgs_plugin.types import Camera
-
-Value = bool | int | float | str
 
 DEFAULT_SCALE = 5.0
 """s_max of all runs but those of the sections curve and sigma (the paper's ablations: 5)"""
-PLAIN: Mapping[str, Value] = {
-    "num_levels": 1,
-    "densify_grad_thresh": 0.0008,
-    "split_screen_size": 0.05,
-    "dropout": 0.0,
-    "opacity_penalty": 0.0,
-    "size_penalty": 0.0,
-    "least_weight": 0.0,
-    "least_views": 0,
-}
-"""settings of lapsplat that make it splatfacto's algorithm: one level, no decay"""
 _DOWNSCALED = re.compile(r"images_\d+$")
 
 

@@ -1,0 +1,101 @@
+"""The papers' claims: each is measured, judged by its condition, and shown with its figures."""
+
+import io
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from fake_lab import SCENE, FakeTools, levels_run
+
+from freqgs_plugin.reports.experiments import claims, claims_measures
+from freqgs_plugin.reports.experiments.claims import CLAIMS, RUNS, training_of
+from freqgs_plugin.reports.experiments.claims_runner import run_claims
+from freqgs_plugin.reports.experiments.options import ClaimsOptions, ExperimentError
+from freqgs_plugin.reports.experiments.training import Trial
+
+BY_NAME = {claim.name: claim for claim in CLAIMS}
+
+
+def run_of(**figures):
+    return {"psnr": 25.0, "gaussians": 100, "counts": [50, 30, 20], "prefixes": [30.0, 28.0, 25.0],
+            "added": [60.0, 8.0, 4.0], "scales": [0.3, 0.2, 0.1], **figures}  # fmt: skip
+
+
+@pytest.mark.parametrize(("gain", "holds"), [(0.94, False), (0.96, True), (-0.3, False)])
+def test_the_gain_over_the_base_method_is_that_of_the_papers_settings(gain, holds):
+    result = {"plain": run_of(), "paper": run_of(psnr=25 + gain), "lapsplat": run_of(psnr=29.0)}
+    verdict = BY_NAME["A-a"].judge("room", [result])
+    assert verdict.holds == holds
+    assert verdict.found == f"{gain:+.2f} dB with the paper's settings, +4.00 dB with ours"
+
+
+@pytest.mark.parametrize(
+    ("count", "time", "holds"), [(64, 7.0, True), (66, 7.0, False), (64, 7.2, False), (10, 20.0, False)]
+)
+def test_fewer_and_faster_are_asked_together(count, time, holds):
+    runs = {"plain": run_of(), "paper": run_of(gaussians=count), "lapsplat": run_of(gaussians=20)}
+    times = {"plain": {"median_ms": 10.0}, "paper": {"median_ms": time}, "lapsplat": {"median_ms": 5.0}}
+    verdict = BY_NAME["A-b"].judge("room", [{"runs": runs, "times": times}])
+    assert verdict.holds == holds and "0.20 of the Gaussians, 2.00 x as fast with ours" in verdict.found
+
+
+def test_what_is_left_out_has_to_matter():
+    paper = run_of()
+    without = {"paper": paper, "no DFT": run_of(added=[60.0, 3.0, 2.0])}
+    assert BY_NAME["A-c"].judge("room", [without]).holds
+    assert not BY_NAME["A-c"].judge("room", [{**without, "no DFT": run_of(added=[60.0, 5.0, 2.0])}]).holds
+    lower = {"paper": paper, "no lower levels": run_of(prefixes=[28.0, 26.0, 25.0])}
+    verdict = BY_NAME["A-d"].judge("room", [lower])
+    assert verdict.holds and verdict.found == "prefix 1: -2.00 dB, prefix 2: -2.00 dB"
+    assert not BY_NAME["A-d"].judge("room", [{**lower, "no lower levels": run_of(prefixes=[28.0, 27.0, 25.0])}]).holds
+    assert BY_NAME["A-e"].judge("room", [{"paper": paper, "unsigned": run_of(gaussians=114)}]).holds
+    assert not BY_NAME["A-e"].judge("room", [{"paper": paper, "unsigned": run_of(gaussians=112)}]).holds
+    sizes = {"paper": run_of(scales=[0.3, 0.1, 0.2]), "lapsplat": paper}
+    assert (
+        not BY_NAME["A-f"].judge("room", [sizes]).holds
+        and BY_NAME["A-f"].judge("room", [{**sizes, "paper": paper}]).holds
+    )
+
+
+def test_figures_of_levels_are_of_prefixes_and_changes():
+    run = levels_run()
+    found = claims_measures.figures(run)
+    assert found["counts"] == [20, 20, 20] and found["gaussians"] == 60 == found["drawn"]
+    assert len(found["prefixes"]) == len(found["added"]) == len(found["scales"]) == 3
+    # the last prefix is the picture itself
+    assert found["prefixes"][2] == pytest.approx(found["psnr"], abs=1e-4)
+    assert all(value > 0 for value in found["added"])
+
+
+def test_all_claims_are_measured_once_and_shown(tmp_path, monkeypatch):
+    monkeypatch.setattr(claims_measures, "FOVEATED_SIZE", (48, 32))
+    docs = tmp_path / "docs" / "claims.md"
+    docs.parent.mkdir()
+    options = ClaimsOptions(
+        output_dir=tmp_path / "out", demo=False, scenes=(Path("room"),), frames=4, steps=30, docs=docs
+    )
+    tools = FakeTools(tmp_path / "runs")
+    console = Console(width=300, record=True, file=io.StringIO())
+    with pytest.raises(ExperimentError, match="nothing finished"):
+        run_claims(ClaimsOptions(**{**vars(options), "page_only": True}), [SCENE], tools.tools(), console)
+    found = run_claims(options, [SCENE], tools.tools(), console)
+    assert {name for name in found if found[name]} == {*BY_NAME, "runs"}
+    assert len(tools.trained) == len({str(training) for training in tools.trained})
+    page = docs.read_text(encoding="utf-8")
+    assert page == (tmp_path / "out" / "claims.md").read_text(encoding="utf-8")
+    for claim in CLAIMS:
+        (row,) = (line for line in page.splitlines() if line.startswith(f"| {claim.name} "))
+        assert row.endswith(("| holds |", "| does not hold |")) and claim.paper in row
+    assert all(f"| {name} |" in page for name in RUNS)
+    again = FakeTools(tmp_path / "runs")
+    run_claims(options, [SCENE], again.tools(), console)
+    assert again.trained == []
+
+
+def test_the_papers_settings_are_those_of_the_registered_method():
+    assert claims.VARIANTS["paper"] == ("lapsplat-paper", {})
+    assert training_of(Trial(SCENE, 30, 42), "clodsplat-paper").method == "clodsplat-paper"
