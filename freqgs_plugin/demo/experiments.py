@@ -85,7 +85,7 @@ def scene_of(folder: Path) -> "ExperimentScene":
 
 
 def demo_scene(options: TrialOptions) -> "ExperimentScene":
-    """The demo scene, ray-traced unless it is there, with a camera that goes from 0.3 to 3.9 m."""
+    """The demo scene, ray-traced unless it is there, with a camera that goes from 0.3 to 3.1 m."""
     from freqgs_plugin.demo.dataset import MANIFEST, SceneOptions, write_scene
     from freqgs_plugin.demo.scene import build_world, zoom_path
     from freqgs_plugin.reports.experiments.training import ExperimentScene

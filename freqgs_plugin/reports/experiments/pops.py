@@ -34,9 +34,9 @@ many Gaussians as clodsplat draws at s_v = {DEFAULT_SCALE:g}.
 
 * *sweep*: s_v rises from 1 to {DEFAULT_SCALE:g} in equal steps, seen from the middle held-out view.
 * *dolly*: the camera goes away in a straight line, distance growing more than tenfold by equal factors, at s_v =
-  {HELD_SCALE:g}. In the demo scene from the dice to the wall; elsewhere on the line through the middle held-out view
-  and what it looks at. The camera's own motion changes every frame: *{CAMERA}* shows how much. Where that jumps, too,
-  the camera goes through Gaussians (in the demo scene those of a wall, and floaters): no work of the level of detail.
+  {HELD_SCALE:g}. In the demo scene away from the dice; elsewhere on the line through the middle held-out view and what
+  it looks at. The camera's own motion changes every frame: *{CAMERA}* shows how much. Where that jumps, too, the camera
+  goes through Gaussians: no work of the level of detail.
 * *fading alone*: each frame of the dolly against the same frame with the weights of the frame before, so without the
   camera's motion."""
 
@@ -59,7 +59,11 @@ def measure(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
         with lab.progress.task(f"{trial.scene.name}: frames", len(variants(run))) as advance:
             return jumps(run, models, view, cameras, options.frames, advance)
 
-    more = {"frames": options.frames, "scale": HELD_SCALE, "coarse": "as many as are drawn at s_max"}
+    more: dict[str, Any] = {
+        "frames": options.frames, "scale": HELD_SCALE, "coarse": "as many as are drawn at s_max"
+    }  # fmt: skip
+    if trial.scene.dolly is not None:
+        more["way"] = [[round(float(x), 3) for x in camera.centre] for camera in trial.scene.dolly[:: options.frames]]
     return lab.step("pops", [clod, plain], more, do)
 
 
