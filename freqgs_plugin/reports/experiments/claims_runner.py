@@ -68,7 +68,7 @@ def run_claims(options: ClaimsOptions, scenes: Sequence[ExperimentScene], tools:
             console.print(text, soft_wrap=True, highlight=False, markup=False)
             raise
     found, files = _report(options, scenes, Lab(store, tools, Silent(), log, only_finished=True))
-    console.print(claim_table(found).rich())
+    console.print(verdict_table(found).rich())
     for path in files:
         console.print(str(path), soft_wrap=True, highlight=False, markup=False)
     return found
@@ -108,7 +108,7 @@ def collect(options: ClaimsOptions, scenes: Sequence[ExperimentScene], lab: Lab)
     return found
 
 
-def claim_table(found: Found) -> BenchTable:
+def _judged(found: Found) -> list[Row]:
     """One row per claim and scene."""
     rows: list[Row] = []
     for claim in CLAIMS:
@@ -117,11 +117,19 @@ def claim_table(found: Found) -> BenchTable:
             rows.append({"claim": claim, "scene": scene, "seeds": len(results), **asdict(verdict)})
         if not found[claim.name]:
             rows.append({"claim": claim, "scene": "-", "seeds": 0, "found": "-", "holds": None})
-    words = {True: "holds", False: "does not hold", None: "not measured"}
+    return rows
+
+
+def _verdict(row: Row) -> str:
+    return {True: "holds", False: "does not hold", None: "not measured"}[row["holds"]]
+
+
+def claim_table(found: Found) -> BenchTable:
+    """For the page: what is claimed, when it holds, and what was found."""
     return BenchTable(
         "claims",
         "The papers' claims",
-        rows,
+        _judged(found),
         [
             ("", lambda row: row["claim"].name),
             ("claim", lambda row: row["claim"].text),
@@ -130,7 +138,22 @@ def claim_table(found: Found) -> BenchTable:
             ("scene", lambda row: row["scene"]),
             ("found", lambda row: row["found"]),
             ("seeds", lambda row: str(row["seeds"])),
-            ("", lambda row: words[row["holds"]]),
+            ("", _verdict),
+        ],
+    )
+
+
+def verdict_table(found: Found) -> BenchTable:
+    """For a terminal."""
+    return BenchTable(
+        "verdicts",
+        "The papers' claims",
+        _judged(found),
+        [
+            ("", lambda row: row["claim"].name),
+            ("scene", lambda row: row["scene"]),
+            ("", _verdict),
+            ("found", lambda row: row["found"]),
         ],
     )
 
