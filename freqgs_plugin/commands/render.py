@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from freqgs_plugin.apps.amount import Amount, parse_amount
-from freqgs_plugin.apps.filters import apply_filter
 from freqgs_plugin.apps.foveation import Foveation
 from freqgs_plugin.apps.gaze import Point, gaze_points, salient_point
+from freqgs_plugin.apps.own_filters import filter_file, find_filter
 from freqgs_plugin.apps.segmenters import SegmenterError
 from freqgs_plugin.commands.focusing import focus_on
 from freqgs_plugin.commands.frames import FrameFolder, FrameRecord, write_video
@@ -71,6 +71,8 @@ def _check(options: RenderOptions) -> Amount | None:
         Foveation((0.5, 0.5), options.gaze_sigma, options.gaze_radius)
         if not Path(options.gaze).is_file():
             gaze_points(options.gaze, 1)
+    if options.filter != "none":
+        find_filter(options.filter)
     return None if options.budget is None else parse_amount(options.budget)
 
 
@@ -94,15 +96,15 @@ def _settings(options: RenderOptions) -> dict[str, Any]:
     """What decides about pictures."""
     left_out = ("output_dir", "video", "fps")
     chosen = {f.name: getattr(options, f.name) for f in fields(options) if f.name not in left_out}
-    files = [p for p in (options.load_config, options.ply, options.path) if p is not None]
-    chosen["files"] = [p.stat().st_mtime for p in files if p.is_file()]
+    files = [options.load_config, options.ply, options.path, filter_file(options.filter)]
+    chosen["files"] = [p.stat().st_mtime for p in files if p is not None and p.is_file()]
     if options.gaze is not None and Path(options.gaze).is_file():
         chosen["gaze"] = Path(options.gaze).read_text(encoding="utf-8")
     return {key: str(value) if isinstance(value, Path) else value for key, value in chosen.items()}
 
 
 def _look(options: RenderOptions, amount: Amount | None, scene: Scene, shot: Shot, console: "Console") -> Look:
-    gaussians = scene.gaussians if options.filter == "none" else apply_filter(scene.gaussians, options.filter)
+    gaussians = scene.gaussians if options.filter == "none" else find_filter(options.filter)(scene.gaussians)
     parts: list[Attenuation] = []
     if options.focus is not None:
         shown = replace(scene, gaussians=gaussians)

@@ -11,6 +11,7 @@ from freqgs_plugin.cli import main
 from freqgs_plugin.io.images import read_image, to_uint8, write_image
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.ply import write_ply
+from freqgs_plugin.reports.contact_sheet import GAP, LABEL
 from freqgs_plugin.studio.checkpoint import load_run
 
 pytestmark = pytest.mark.slow
@@ -141,6 +142,7 @@ def test_focus_from_masks_and_from_a_box(trained, tmp_path, render):
         (("--gaze", "0.5,0.5", "--gaze-sigma", "0"), "sigma is 0"),
         (("--size", "0", "5"), "at least 1 px"),
         (("--fps", "0"), "fps is 0"),
+        (("--filter", "pencil"), "filter is 'pencil'"),
         (("--load-config", "RUN", "--path", "nowhere.json"), "nowhere.json is no file"),
         (("--load-config", "RUN", "--path", "RUN"), "is no camera path"),
         (("--load-config", "RUN", "--focus", "nowhere"), "nowhere is no folder"),
@@ -159,3 +161,47 @@ def test_what_cannot_be_drawn_is_said(trained, tmp_path, monkeypatch, capsys, ar
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
     assert not (tmp_path / "renders").exists()
+
+
+OWN = """
+from dataclasses import replace
+
+def dim(gaussians):
+    return replace(gaussians, opacities=gaussians.opacities * 0.5)
+"""
+
+
+def test_a_sheet_of_filters_with_ones_own(trained, tmp_path, monkeypatch, capsys, render):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text(OWN)
+    main(["filters", "--load-config", str(trained), "--filters", "xray", "own.py:dim", "--output", "a/sheet.png"])
+    out = capsys.readouterr().out
+    assert "xray" in out and "dim" in out
+    sheet = read_image(tmp_path / "a" / "sheet.png")
+    assert sheet.shape[1] == 3 * (SIZE[0] + GAP) + GAP and sheet.shape[0] == 3 * (SIZE[1] + LABEL + GAP)
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["sheet.png"]
+    render("--load-config", trained, "--filter", "own.py:dim", "--output-dir", tmp_path / "dim")
+    name = next(iter(frames(tmp_path / "dim")))
+    shown = read_image(tmp_path / "dim" / f"{name}.png")[:, :, :3]
+    in_sheet = [
+        sheet[LABEL + i * (SIZE[1] + LABEL + GAP) :, 2 * SIZE[0] + 3 * GAP :][: SIZE[1], : SIZE[0], :3]
+        for i in range(3)
+    ]
+    assert min(np.abs(shown.astype(int) - picture).max() for picture in in_sheet) <= 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--filters", "pencil"), "filter is 'pencil'"),
+        (("--filters", "nowhere.py:f"), "nowhere.py is no file"),
+        (("--views", "0"), "--views is 0"),
+        (("--views", "99"), "--views is 99, and the run has 9 views"),
+        (("--output", "sheet.jpg"), "the ending .png"),
+    ],
+)
+def test_a_sheet_that_cannot_be_made_is_said(trained, tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(["filters", "--load-config", str(trained), *arguments])
+    assert message in capsys.readouterr().err and not list(tmp_path.iterdir())

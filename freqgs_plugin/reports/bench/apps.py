@@ -1,4 +1,4 @@
-"""`freqgs bench apps`: what foveation and an index of the base gain on a trained run, and what they lose."""
+"""`freqgs bench apps`: what foveation and an index of the base gain on a trained run, what they lose, and filters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,13 +8,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from freqgs_plugin.apps.filters import FILTERS
 from freqgs_plugin.apps.foveation import Foveation
 from freqgs_plugin.apps.geometry import GeometryIndex
+from freqgs_plugin.apps.own_filters import find_filter
 from freqgs_plugin.reports.bench.options import BenchError, BenchOptions
 from freqgs_plugin.reports.bench.rounds import patient
 from freqgs_plugin.reports.bench.runner import Bench, Measured, Tick
 from freqgs_plugin.reports.bench.tables import BenchTable, Row, milliseconds, number, ratio
 from freqgs_plugin.reports.drawing import draw
+from freqgs_plugin.reports.filters import STEP, FilterRow, draw_filters, spread
 from freqgs_plugin.reports.tables import psnr
 from freqgs_plugin.reports.timing import Timing, measure
 from freqgs_plugin.types import Camera, Gaussians
@@ -29,27 +32,33 @@ SETTINGS = ((0.1, 0.02), (0.1, 0.05), (0.1, 0.1), (0.1, 0.2), (0.0, 0.05), (0.0,
 POINTS = 100_000
 QUICK_POINTS = 2_000
 SEED = 0
+FILTERED_VIEWS = 3
 PATIENCE = 12.0
 """for the rounds of one size, seconds"""
 
 
 @dataclass(frozen=True)
 class AppSubject:
-    """A trained run of several levels, and one of its views."""
+    """A trained run of several levels, and views of it."""
 
     run: Any
-    view: Any
+    views: Sequence[Any]
+
+    @property
+    def view(self) -> Any:
+        """The one that foveation is measured on."""
+        return self.views[0]
 
 
 def app_subject(run: Any, views: Sequence[Any]) -> AppSubject:
-    """The run and its first view.
+    """The run and a few of its views.
 
     Raises:
         BenchError: the scene has one level.
     """
     if int(run.gaussians.level.max()) < 2:
         raise BenchError("this scene has one level, and foveation and an index of the base are about several.")
-    return AppSubject(run, views[0])
+    return AppSubject(run, [views[i] for i in spread(len(views), FILTERED_VIEWS)])
 
 
 def apps_bench(options: BenchOptions, subject: AppSubject) -> Bench:
@@ -61,11 +70,13 @@ def apps_bench(options: BenchOptions, subject: AppSubject) -> Bench:
         for width, height in sizes:
             tick(f"foveation at {width}x{height}")
             rows += foveation_rows(subject, width, height, options)
+        tick("filters")
+        filtered = draw_filters(subject.run, subject.views, {name: find_filter(name) for name in FILTERS})[0]
         tick("geometry")
         found = geometry_rows(subject.run.gaussians, QUICK_POINTS if options.quick else POINTS, options)
-        return Measured([foveation_table(rows), geometry_table(found)], {"points": SEED})
+        return Measured([foveation_table(rows), filters_table(filtered), geometry_table(found)], {"points": SEED})
 
-    return Bench("apps", ("foveation", "geometry"), len(sizes) + 1, run)
+    return Bench("apps", ("foveation", "filters", "geometry"), len(sizes) + 2, run)
 
 
 def foveation_rows(subject: AppSubject, width: int, height: int, options: BenchOptions) -> list[Row]:
@@ -92,7 +103,7 @@ def _foveation_row(
     picture, whole = rendering.features.clamp(0, 1), full.features.clamp(0, 1)
 
     def lost(where: Tensor) -> float:
-        return psnr(whole[where], photo[where]) - psnr(picture[where], photo[where])
+        return psnr(whole[where][None], photo[where][None]) - psnr(picture[where][None], photo[where][None])
 
     return {
         "size": size,
@@ -148,6 +159,26 @@ def foveation_table(rows: Sequence[Row]) -> BenchTable:
         f"One held-out view, gaze in its middle. *Inside*: within {FOVEA:g} of the longer side. *Lost*: PSNR of the "
         "whole picture against the (enlarged) photograph, less that of the foveated one. *RMSE*: against the whole "
         "picture. Radius 0 is the paper's way.",
+    )
+
+
+def filters_table(rows: Sequence[FilterRow]) -> BenchTable:
+    """How much each filter changes, and how far it is the same from a step aside."""
+    return BenchTable(
+        "filters",
+        "Filters",
+        [vars(row) for row in rows],
+        [
+            ("filter", lambda row: row["name"]),
+            ("Gaussians", lambda row: f"{row['gaussians']:,}"),
+            ("changed, RMSE", lambda row: number(row["changed"])),
+            ("step aside, RMSE", lambda row: number(row["step_aside"])),
+            ("seen in both", lambda row: f"{row['shared']:.0%}"),
+        ],
+        f"At most {FILTERED_VIEWS} held-out views. *Changed*: against the plain pictures. *Step aside*: a second "
+        f"picture from {STEP:.0%} of the depth to the right, its colours taken back to the first along that one's "
+        "depth, against the first, where both show the same surface; so what moves with the picture instead of the "
+        "scene counts as an error.",
     )
 
 
