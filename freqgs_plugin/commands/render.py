@@ -12,6 +12,7 @@ from freqgs_plugin.apps.amount import Amount, parse_amount
 from freqgs_plugin.apps.foveation import Foveation
 from freqgs_plugin.apps.gaze import Point, gaze_points, salient_point
 from freqgs_plugin.apps.own_filters import filter_file, find_filter
+from freqgs_plugin.apps.rescaled import render_rescaled, suitable
 from freqgs_plugin.apps.segmenters import SegmenterError
 from freqgs_plugin.commands.focusing import focus_on
 from freqgs_plugin.commands.frames import FrameFolder, FrameRecord, write_video
@@ -69,6 +70,8 @@ def _check(options: RenderOptions) -> Amount | None:
         raise ValueError(f"fps is {options.fps:g}; give frames per second above 0, up to 1000.")
     if options.gaze is not None:
         Foveation((0.5, 0.5), options.gaze_sigma, options.gaze_radius)
+        if options.gaze_scale is not None and options.gaze_scale < 1:
+            raise ValueError(f"gaze-scale is {options.gaze_scale}; it must be a whole number from 1.")
         if not Path(options.gaze).is_file():
             gaze_points(options.gaze, 1)
     if options.filter != "none":
@@ -164,6 +167,14 @@ def _measured(scene: Scene, camera: Camera) -> Callable[[int, float], tuple[int,
     return picture
 
 
+def _foveated(scene: Scene, look: Look, camera: Camera, fovea: Foveation, times: int) -> Rendering:
+    drawing = {"rasterizer": scene.rasterizer, "background": scene.background, "antialiased": scene.antialiased}
+    rendering = render_rescaled(look.gaussians, camera, fovea, look.attenuation, times=times, depth=False, **drawing)
+    if rendering.features.is_cuda:
+        torch.cuda.synchronize()
+    return rendering
+
+
 @torch.no_grad()
 def _picture(scene: Scene, gaussians: Gaussians, camera: Camera, attenuation: Attenuation | None) -> Rendering:
     rendering = render(
@@ -192,14 +203,16 @@ def _draw_all(
         _picture(scene, look.gaussians, shot.cameras[missing[0]], look.attenuation)
     for i in track(missing, "Drawing", console=console, disable=not console.is_terminal):
         camera, gaze, attenuation = shot.cameras[i], gazes[i], look.attenuation
-        if options.gaze is not None:
-            if gaze is None:
-                base = _picture(scene, look.gaussians, camera, LevelCut(1))
-                gaze = salient_point(base.features.clamp(0, 1).cpu().numpy())
-            fovea = Foveation(gaze, options.gaze_sigma, options.gaze_radius)
-            attenuation = fovea if attenuation is None else Product((attenuation, fovea))
+        if options.gaze is not None and gaze is None:
+            base = _picture(scene, look.gaussians, camera, LevelCut(1))
+            gaze = salient_point(base.features.clamp(0, 1).cpu().numpy())
         start = time.perf_counter()
-        rendering = _picture(scene, look.gaussians, camera, attenuation)
+        if gaze is None:
+            rendering = _picture(scene, look.gaussians, camera, attenuation)
+        else:
+            fovea = Foveation(gaze, options.gaze_sigma, options.gaze_radius)
+            times = suitable(camera) if options.gaze_scale is None else options.gaze_scale
+            rendering = _foveated(scene, look, camera, fovea, times)
         milliseconds = 1e3 * (time.perf_counter() - start)
         record = FrameRecord(shot.names[i], int(rendering.info["drawn"]), round(milliseconds, 2), gaze)
         folder.add(record, rendering.features.clamp(0, 1).cpu().numpy())

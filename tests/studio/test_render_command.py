@@ -79,6 +79,22 @@ def test_a_path_with_budget_gaze_and_filter(trained, tmp_path, render):
     assert "at most 300 Gaussians" in text
 
 
+def test_a_gaze_with_fewer_pixels_is_the_same_where_one_looks(trained, tmp_path, render):
+    gaze = ["--gaze", "0.25,0.5", "--gaze-radius", 0.06, "--gaze-sigma", 0.05, "--size", 320, 256]
+    for name, times in (("plain", []), ("fewer", ["--gaze-scale", 4])):
+        render("--load-config", trained, "--output-dir", tmp_path / name, *gaze, *times)
+    assert [r["drawn"] for r in frames(tmp_path / "plain").values()] == [
+        r["drawn"] for r in frames(tmp_path / "fewer").values()
+    ]
+    for name in frames(tmp_path / "plain"):
+        plain, fewer = (read_image(tmp_path / d / f"{name}.png").astype(int) for d in ("plain", "fewer"))
+        y, x = np.indices(plain.shape[:2]) + 0.5
+        inside = np.hypot(x - 80, y - 128) <= 0.06 * 320
+        # large Gaussians near the border of the smaller picture
+        assert np.abs(plain - fewer)[inside].max() <= 4
+        assert np.abs(plain - fewer)[:, 200:].max() > 4
+
+
 def test_a_path_shows_what_the_views_show(trained, tmp_path, render):
     run = load_run(trained)
     path = camera_path(run, tmp_path)
@@ -140,6 +156,7 @@ def test_focus_from_masks_and_from_a_box(trained, tmp_path, render):
         (("--budget", "0"), "at least one"),
         (("--gaze", "2,2"), "outside of the image"),
         (("--gaze", "0.5,0.5", "--gaze-sigma", "0"), "sigma is 0"),
+        (("--gaze", "0.5,0.5", "--gaze-scale", "0"), "gaze-scale is 0"),
         (("--size", "0", "5"), "at least 1 px"),
         (("--fps", "0"), "fps is 0"),
         (("--filter", "pencil"), "filter is 'pencil'"),
