@@ -117,11 +117,24 @@ def _cropped(camera: Camera, window: _Window) -> Camera:
 
 
 def _around(camera: Camera, gaze: tuple[float, float], radius: float) -> _Window:
-    """What of the image the fovea and its seam may touch; `radius` in px."""
+    """What of the image the fovea and its seam may touch; `radius` in px.
+
+    At the border of the image it is as large as elsewhere: the smaller an image, the more Gaussians reach beyond the
+    margin within which the projection is exact. Of a gaze too far outside to be seen, nothing.
+    """
     reach = radius + SEAM * max(camera.width, camera.height)
-    x, y = gaze[0] * camera.width, gaze[1] * camera.height
-    left, top = max(math.floor(x - reach), 0), max(math.floor(y - reach), 0)
-    return _Window(left, top, min(math.ceil(x + reach), camera.width), min(math.ceil(y + reach), camera.height))
+    (left, right), (top, bottom) = (
+        _span(share * size, reach, size) for share, size in zip(gaze, (camera.width, camera.height), strict=True)
+    )
+    return _Window(left, top, right, bottom)
+
+
+def _span(middle: float, reach: float, size: int) -> tuple[int, int]:
+    if middle + reach <= 0 or middle - reach >= size:
+        return 0, 0
+    length = min(math.ceil(2 * reach) + 1, size)
+    low = min(max(math.floor(middle - reach), 0), size - length)
+    return low, low + length
 
 
 def _share(camera: Camera, gaze: tuple[float, float], radius: float, window: _Window) -> Float[Tensor, "h w 1"]:
