@@ -15,7 +15,7 @@ def test_the_code_on_the_page_runs(trained, tmp_path, monkeypatch, capsys):
     (tmp_path / "RUN").symlink_to(trained.parent, target_is_directory=True)
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.S)
-    assert len(blocks) == 8
+    assert len(blocks) == 9
     names = {}
     for block in blocks:
         exec(compile(block, str(PAGE), "exec"), names)
