@@ -82,8 +82,11 @@ def render_rescaled(
     rows = torch.where(weight > 0)[0]
     gaussians, weight = gaussians.select(rows), weight[rows]
 
+    def as_in_full(gaussians: Gaussians, camera: Camera) -> Tensor:
+        return weight
+
     def draw(view: Camera) -> Rendering:
-        return render(gaussians, view, lambda *_: weight, **look)
+        return render(gaussians, view, as_in_full, **look)
 
     small = smaller(camera, times)
     radius = max(foveation.radius, foveation.sigma) * max(camera.width, camera.height)
