@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Union
 
 from tyro.conf import arg
 
-from freqgs_plugin.commands.options import CommandError, RenderOptions
+from freqgs_plugin.commands.options import CommandError, FilterOptions, RenderOptions
 from freqgs_plugin.demo.benches import BENCHES as DEMO_BENCHES
 from freqgs_plugin.demo.experiments import EXPERIMENTS
 from freqgs_plugin.reports.bench.commands import BENCHES
@@ -63,6 +63,18 @@ def render(options: Annotated[RenderOptions, arg(name="")] = RenderOptions()) ->
     run_render(options, Console())
 
 
+def filters(options: Annotated[FilterOptions, arg(name="")]) -> None:
+    """Draw artistic filters side by side from several views, as one PNG file; one's own filters, too.
+
+    Prints how much each changes the pictures, and how far it is the same from a step aside.
+    """
+    from rich.console import Console
+
+    from freqgs_plugin.commands.filters import run_filters
+
+    run_filters(options, Console())
+
+
 def stability(
     output_dir: Path = Path("stability-out"),
     only: Literal["geometry", "compositing", "decay", "losses", "autocast", "training"] | None = None,
@@ -88,6 +100,7 @@ def stability(
 COMMANDS = {
     "demo": demo,
     "render": render,
+    "filters": filters,
     "stability": stability,
     "bench": {**BENCHES, **DEMO_BENCHES},
     "experiment": EXPERIMENTS,

@@ -7,12 +7,14 @@ nothing there, so that view has no say about it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from freqgs_plugin.apps.masks import check_masks
+from freqgs_plugin.apps.masks import MaskError, check_masks, read_masks
 from freqgs_plugin.apps.visibility import VISIBLE, composite, empty_weights, view_weights
 from freqgs_plugin.functional.attenuation import Attenuation
 from freqgs_plugin.functional.projection import NEAR_PLANE, working_dtype
@@ -95,6 +97,24 @@ def vote(
     for camera, mask in zip(cameras, masks, strict=True):
         weights += view_weights(gaussians, camera, mask, **options)
     return elected(weights, share)
+
+
+def vote_in_folder(
+    gaussians: Gaussians, names: Sequence[str], cameras: Sequence[Camera], folder: Path, **options: Any
+) -> Selection:
+    """`vote` by the masks in `folder`, which are called like the views; `options` are those of `vote`.
+
+    Raises:
+        MaskError: as `read_masks`, or no Gaussian lies in the masks.
+    """
+    masks = read_masks(folder, names, cameras)
+    found = vote(gaussians, [cameras[i] for i in masks], list(masks.values()), **options)
+    if not found.count:
+        raise MaskError(
+            f"of none of the {len(gaussians):,} Gaussians does most lie within the masks in {folder}; mark the whole "
+            "object, in views that show it."
+        )
+    return found
 
 
 def elected(weights: Float[Tensor, "n 2"], share: float | int = 0.5) -> Selection:

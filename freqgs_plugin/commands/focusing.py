@@ -4,9 +4,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from freqgs_plugin.apps.focus import Focus, Selection, vote
+from freqgs_plugin.apps.focus import Focus, Selection, vote, vote_in_folder
 from freqgs_plugin.apps.grabcut import mask_from_box, mask_from_point
-from freqgs_plugin.apps.masks import read_masks
 from freqgs_plugin.apps.propagate import propagate
 from freqgs_plugin.apps.segmenters import get_segmenter, prompt_masks
 from freqgs_plugin.commands.scene import Scene
@@ -37,9 +36,8 @@ def focus_on(scene: Scene, text: str, outside_level: int, weights: Path | None) 
     marked = re.fullmatch(r"(.+):(\d+(?:,\d+){1,3})", text)
     if marked is None:
         views = [*views, *views_of_split(scene.run, "test")]
-        cameras = [view.camera for view in views]
-        given = read_masks(Path(text), [view.name for view in views], cameras)
-        found = vote(scene.gaussians, [cameras[i] for i in given], list(given.values()), **drawing)
+        names, cameras = [view.name for view in views], [view.camera for view in views]
+        found = vote_in_folder(scene.gaussians, names, cameras, Path(text), **drawing)
         return Focus(found.rows, outside_level), found
     found = _from_one_view(scene, views, marked[1], [int(n) for n in marked[2].split(",")], drawing)
     return Focus(found.rows, outside_level), found

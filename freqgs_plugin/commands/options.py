@@ -37,6 +37,9 @@ class RenderOptions:
     """of the disc without loss, share of the longer side"""
     gaze_sigma: float = 0.1
     """how fast detail falls off beyond, share of the longer side"""
+    gaze_scale: int | None = None
+    """how many times smaller the picture outside of the fovea is drawn, and enlarged; 1: at full size; without it the
+    most, up to 4, that leaves it 960 px on the longer side"""
     focus: str | None = None
     """all levels for one object: a folder of masks, VIEW:left,top,right,bottom or VIEW:x,y (pixels, grown by GrabCut),
     or text:PROMPT (needs the extra `prompt`)"""
@@ -44,11 +47,25 @@ class RenderOptions:
     """levels that are drawn outside of the object; 0: the object alone"""
     segmenter_weights: Path | None = None
     """folder with CLIPSeg's weights for --focus text:...; without it the Hugging Face cache"""
-    filter: Literal["none", "xray", "brush", "sharp"] = "none"
-    """artistic filter by level"""
+    filter: str = "none"
+    """artistic filter by level: xray, brush, sharp, or one of your own as FILE.py:FUNCTION"""
     video: Literal["paths", "always", "never"] = "paths"
     """when to write video.mp4 as well: of camera paths, always or never"""
     fps: float | None = None
     """of the video, frames per second; without it the path's, or 24"""
     rasterizer: str = "auto"
     """torch, numba, gsplat or auto"""
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """Whose filters are shown, from where, and in which file."""
+
+    load_config: Path
+    """config.yml of a trained run"""
+    output: Path = Path("filters.png")
+    """the sheet: a row per view, a column per filter"""
+    views: int = 3
+    """how many views, spread evenly over those held out (over all, where these are too few)"""
+    filters: tuple[str, ...] = ("xray", "brush", "sharp")
+    """names, or FILE.py:FUNCTION for a filter of your own"""

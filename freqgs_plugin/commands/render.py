@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from freqgs_plugin.apps.amount import Amount, parse_amount
-from freqgs_plugin.apps.filters import apply_filter
 from freqgs_plugin.apps.foveation import Foveation
 from freqgs_plugin.apps.gaze import Point, gaze_points, salient_point
+from freqgs_plugin.apps.own_filters import filter_file, find_filter
+from freqgs_plugin.apps.rescaled import render_rescaled, suitable
 from freqgs_plugin.apps.segmenters import SegmenterError
 from freqgs_plugin.commands.focusing import focus_on
 from freqgs_plugin.commands.frames import FrameFolder, FrameRecord, write_video
@@ -69,8 +70,12 @@ def _check(options: RenderOptions) -> Amount | None:
         raise ValueError(f"fps is {options.fps:g}; give frames per second above 0, up to 1000.")
     if options.gaze is not None:
         Foveation((0.5, 0.5), options.gaze_sigma, options.gaze_radius)
+        if options.gaze_scale is not None and options.gaze_scale < 1:
+            raise ValueError(f"gaze-scale is {options.gaze_scale}; it must be a whole number from 1.")
         if not Path(options.gaze).is_file():
             gaze_points(options.gaze, 1)
+    if options.filter != "none":
+        find_filter(options.filter)
     return None if options.budget is None else parse_amount(options.budget)
 
 
@@ -94,15 +99,15 @@ def _settings(options: RenderOptions) -> dict[str, Any]:
     """What decides about pictures."""
     left_out = ("output_dir", "video", "fps")
     chosen = {f.name: getattr(options, f.name) for f in fields(options) if f.name not in left_out}
-    files = [p for p in (options.load_config, options.ply, options.path) if p is not None]
-    chosen["files"] = [p.stat().st_mtime for p in files if p.is_file()]
+    files = [options.load_config, options.ply, options.path, filter_file(options.filter)]
+    chosen["files"] = [p.stat().st_mtime for p in files if p is not None and p.is_file()]
     if options.gaze is not None and Path(options.gaze).is_file():
         chosen["gaze"] = Path(options.gaze).read_text(encoding="utf-8")
     return {key: str(value) if isinstance(value, Path) else value for key, value in chosen.items()}
 
 
 def _look(options: RenderOptions, amount: Amount | None, scene: Scene, shot: Shot, console: "Console") -> Look:
-    gaussians = scene.gaussians if options.filter == "none" else apply_filter(scene.gaussians, options.filter)
+    gaussians = scene.gaussians if options.filter == "none" else find_filter(options.filter)(scene.gaussians)
     parts: list[Attenuation] = []
     if options.focus is not None:
         shown = replace(scene, gaussians=gaussians)
@@ -162,6 +167,14 @@ def _measured(scene: Scene, camera: Camera) -> Callable[[int, float], tuple[int,
     return picture
 
 
+def _foveated(scene: Scene, look: Look, camera: Camera, fovea: Foveation, times: int) -> Rendering:
+    drawing = {"rasterizer": scene.rasterizer, "background": scene.background, "antialiased": scene.antialiased}
+    rendering = render_rescaled(look.gaussians, camera, fovea, look.attenuation, times=times, depth=False, **drawing)
+    if rendering.features.is_cuda:
+        torch.cuda.synchronize()
+    return rendering
+
+
 @torch.no_grad()
 def _picture(scene: Scene, gaussians: Gaussians, camera: Camera, attenuation: Attenuation | None) -> Rendering:
     rendering = render(
@@ -190,14 +203,16 @@ def _draw_all(
         _picture(scene, look.gaussians, shot.cameras[missing[0]], look.attenuation)
     for i in track(missing, "Drawing", console=console, disable=not console.is_terminal):
         camera, gaze, attenuation = shot.cameras[i], gazes[i], look.attenuation
-        if options.gaze is not None:
-            if gaze is None:
-                base = _picture(scene, look.gaussians, camera, LevelCut(1))
-                gaze = salient_point(base.features.clamp(0, 1).cpu().numpy())
-            fovea = Foveation(gaze, options.gaze_sigma, options.gaze_radius)
-            attenuation = fovea if attenuation is None else Product((attenuation, fovea))
+        if options.gaze is not None and gaze is None:
+            base = _picture(scene, look.gaussians, camera, LevelCut(1))
+            gaze = salient_point(base.features.clamp(0, 1).cpu().numpy())
         start = time.perf_counter()
-        rendering = _picture(scene, look.gaussians, camera, attenuation)
+        if gaze is None:
+            rendering = _picture(scene, look.gaussians, camera, attenuation)
+        else:
+            fovea = Foveation(gaze, options.gaze_sigma, options.gaze_radius)
+            times = suitable(camera) if options.gaze_scale is None else options.gaze_scale
+            rendering = _foveated(scene, look, camera, fovea, times)
         milliseconds = 1e3 * (time.perf_counter() - start)
         record = FrameRecord(shot.names[i], int(rendering.info["drawn"]), round(milliseconds, 2), gaze)
         folder.add(record, rendering.features.clamp(0, 1).cpu().numpy())

@@ -13,6 +13,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from freqgs_plugin.io.check_images import SceneError, some
 from freqgs_plugin.io.check_scene import SceneSummary, check_colmap_scene, find_model
+from freqgs_plugin.studio.cameras import to_camera
+from freqgs_plugin.types import Camera
+
+NAMED_CAMERAS = "named_cameras"
+"""key in the metadata of the dataset trained on, and so of a model: `SceneDatamanager.named_cameras`"""
 
 
 @dataclass
@@ -45,6 +50,17 @@ class SceneDatamanager(FullImageDatamanager):
             _look_at_transforms(data)
         super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         _look_at_views(self.train_dataset, data)
+        # all that nerfstudio hands to a model
+        self.train_dataset.metadata[NAMED_CAMERAS] = self.named_cameras
+
+    def named_cameras(self) -> tuple[list[str], list[Camera]]:
+        """File names and cameras of the views trained on, and then of those held out, on the CPU."""
+        names, cameras = [], []
+        # looked at first: nerfstudio undistorts images and cameras as it reads them
+        for _, dataset in ((self.cached_train, self.train_dataset), (self.cached_eval, self.eval_dataset)):
+            names += [Path(file).name for file in dataset.image_filenames]
+            cameras += [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
+        return names, cameras
 
 
 def _look_at_colmap(parser: ColmapDataParserConfig, data: Path, thorough: bool) -> None:

@@ -7,7 +7,9 @@ from typing import Any, Literal
 from nerfstudio.viewer.viewer_elements import ViewerButton, ViewerDropdown, ViewerElement, ViewerSlider
 
 from freqgs_plugin.apps.filters import FILTERS
+from freqgs_plugin.apps.focus import Focus
 from freqgs_plugin.apps.foveation import Foveation
+from freqgs_plugin.apps.gaze import salient_point
 from freqgs_plugin.apps.geometry import GeometryIndex
 from freqgs_plugin.apps.region import Ball
 from freqgs_plugin.functional.attenuation import Attenuation
@@ -21,6 +23,7 @@ from freqgs_plugin.studio.controls import (
     gaze_slider,
     uninterrupted,
 )
+from freqgs_plugin.studio.masking import MaskedObject, Surroundings
 from freqgs_plugin.types import Gaussians
 
 Mode = Literal["all", "prefix", "band", "scale", "budget"]
@@ -31,7 +34,7 @@ MODES = {
     "scale": "as if seen from as many times as far as the slider says",
     "budget": "the same, and at most so many Gaussians",
 }
-OFF, CLICK, MIDDLE = "off", "click", "middle"
+OFF, CLICK, MIDDLE, SALIENT, MASKS = "off", "click", "middle", "salient", "masks"
 
 
 class Panel(ViewerElement[str]):
@@ -48,13 +51,16 @@ class Panel(ViewerElement[str]):
         self.mode = ViewerDropdown("Mode", modes[0], list(modes), hint=hint)
         self.slider = slider
         self.budget = budget_number()
-        self.gaze = _choice("Gaze", [OFF, CLICK, MIDDLE], "Full detail where one looks, and less farther out.")
+        hint = f"Full detail where one looks, and less farther out; {SALIENT}: at what stands out most."
+        self.gaze = _choice("Gaze", [OFF, CLICK, MIDDLE, SALIENT], hint)
         self.gaze_radius = gaze_slider()
         self.gaze_button = _button("Move the gaze")
         self.filter = _choice("Filter", [OFF, *FILTERS], "Changes colours, places and opacities by level.")
-        self.focus = _choice("Focus", [OFF, CLICK], "Full detail around a clicked point, and level 1 elsewhere.")
+        hint = f"Full detail around a clicked point, or of what {MASKS} mark, and level 1 elsewhere."
+        self.focus = _choice("Focus", [OFF, CLICK, MASKS], hint)
         self.focus_radius = focus_slider()
         self.focus_button = _button("Move the focus")
+        self.masked = MaskedObject(self.say, lambda: self.cb_hook(self))
         self.drawn = drawn_text()
         self.note = Note()
         self._levels = levels
@@ -71,7 +77,7 @@ class Panel(ViewerElement[str]):
         return [
             *(self.mode, self.slider, self.budget),
             *(self.gaze, self.gaze_radius, self.gaze_button, self.filter),
-            *(self.focus, self.focus_radius, self.focus_button),
+            *(self.focus, self.focus_radius, self.focus_button, self.masked.folder, self.masked.button),
             *(self.drawn, self.note),
         ]
 
@@ -80,7 +86,7 @@ class Panel(ViewerElement[str]):
 
     def install(self, viser_server: Any) -> None:
         for element in self.elements():
-            if element not in (self.drawn, self.note, self.gaze_button, self.focus_button):
+            if element not in (self.drawn, self.note, self.gaze_button, self.focus_button, *self._of_masks()):
                 element.cb_hook = self._changed
             element.install(viser_server)
         for choice, button, wait in (
@@ -90,7 +96,12 @@ class Panel(ViewerElement[str]):
             assert choice.gui_handle is not None
             choice.gui_handle.on_update(wait)
             button.gui_handle.on_click(wait)
+        assert self.masked.button.gui_handle is not None
+        self.masked.button.gui_handle.on_click(lambda _: self.masked.ask())
         viser_server.on_client_disconnect(lambda client: self._clicks.forget(client.client_id))
+
+    def _of_masks(self) -> tuple[ViewerElement, ...]:
+        return self.masked.folder, self.masked.button
 
     def set_slider(self, slider: ViewerSlider, levels: int) -> None:
         """Another range, before the viewer has started; then the old slider stays, which means the same."""
@@ -114,8 +125,9 @@ class Panel(ViewerElement[str]):
             (self.gaze_button, gaze == CLICK),
             (self.filter, several),
             (self.focus, several),
-            (self.focus_radius, focus != OFF),
+            (self.focus_radius, focus == CLICK),
             (self.focus_button, focus == CLICK),
+            *((element, focus == MASKS) for element in self._of_masks()),
         ):
             _show(element, visible)
 
@@ -192,21 +204,36 @@ class Panel(ViewerElement[str]):
             self.say("budget", f"The budget is {thousands:g}; it must be 0 (no bound) or more. The last stays: {last}.")
         return self._count
 
-    def around(self, gaussians: Gaussians) -> list[Attenuation]:
+    def around(self, gaussians: Gaussians, surroundings: Surroundings) -> list[Attenuation]:
         """Gaze and focus."""
         found: list[Attenuation] = []
         if self._levels < 2:
             return found
         if self.gaze.value != OFF:
-            gaze = (0.5, 0.5) if self.gaze.value == MIDDLE else self._clicks.here().gaze
+            gaze = self._gaze(surroundings)
             if gaze is not None:
                 found.append(Foveation(gaze, radius=float(self.gaze_radius.value)))
-        if self.focus.value != OFF:
+        if self.focus.value != MASKS:
+            self.masked.off()
+        if self.focus.value == CLICK:
             self._find_target(gaussians)
             target = self._clicks.here().target
             if target is not None:
                 found.append(Ball(target[0], float(self.focus_radius.value) * target[1]))
+        elif self.focus.value == MASKS:
+            rows = self.masked.rows(gaussians, surroundings)
+            if rows is not None:
+                found.append(Focus(rows))
         return found
+
+    def _gaze(self, surroundings: Surroundings) -> tuple[float, float] | None:
+        if self.gaze.value == MIDDLE:
+            return 0.5, 0.5
+        if self.gaze.value == SALIENT:
+            # it imports
+            with uninterrupted():
+                return salient_point(surroundings.base())
+        return self._clicks.here().gaze
 
     def _find_target(self, gaussians: Gaussians) -> None:
         """What the last click has met, if no picture has asked yet."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
@@ -14,7 +15,7 @@ from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel, get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from freqgs_plugin.functional.attenuation import Attenuation, Product
+from freqgs_plugin.functional.attenuation import Attenuation, LevelCut, Product
 from freqgs_plugin.functional.budget import LevelBudget
 from freqgs_plugin.functional.image_loss import ssim
 from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
@@ -22,12 +23,17 @@ from freqgs_plugin.rendering.render import render
 from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.config import FreqSplatModelConfig
 from freqgs_plugin.studio.controls import Stopwatch, in_viewer, uninterrupted
+from freqgs_plugin.studio.datamanager import NAMED_CAMERAS
 from freqgs_plugin.studio.filtering import FilterCache
 from freqgs_plugin.studio.lpips import lpips_if_available
+from freqgs_plugin.studio.masking import Surroundings
 from freqgs_plugin.studio.outputs import LazyOutputs
 from freqgs_plugin.studio.panel import OFF, Panel
 from freqgs_plugin.training.initialise import initial_parameters, random_points
 from freqgs_plugin.types import Camera, Gaussians, Rendering, Splats
+
+SMALL = 256
+"""px: longer side of the picture in which the most salient place is looked for"""
 
 
 class uncached_property(cached_property):
@@ -248,7 +254,7 @@ class SplatViews(SplatfactoModel):
 
     def _viewer_rendering(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> Rendering:
         """The picture that the viewer's controls ask for."""
-        around = self.controls.around(gaussians)
+        around = self.controls.around(gaussians, self._surroundings(gaussians, camera, background))
 
         def draw(attenuation: Attenuation | None) -> Rendering:
             parts = around if attenuation is None else [attenuation, *around]
@@ -259,6 +265,23 @@ class SplatViews(SplatfactoModel):
         if less is None:
             return rendering
         return replace(rendering, features=0.5 + rendering.features - draw(less).features)
+
+    def _surroundings(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> Surroundings:
+        def base() -> np.ndarray:
+            factor = max(camera.width, camera.height) / SMALL
+            K = camera.K.clone()
+            K[:2] /= factor
+            sides = max(round(camera.width / factor), 1), max(round(camera.height / factor), 1)
+            small = Camera(camera.viewmat, K, *sides)
+            return show(self.draw(gaussians, small, background, LevelCut(1)).features).cpu().numpy()
+
+        def views() -> tuple[list[str], list[Camera]]:
+            named = (self.kwargs.get("metadata") or {}).get(NAMED_CAMERAS)
+            if named is None:
+                raise ValueError("the run's datamanager names no views, so masks cannot be matched to any.")
+            return named()
+
+        return Surroundings(base, views, {"rasterizer": self.rasterizer(), "antialiased": self.antialiased})
 
     # -- evaluation and export ------------------------------------------------------------------------------------
 

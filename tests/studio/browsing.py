@@ -149,11 +149,11 @@ class Page:
         field.click()
         self.page.get_by_role("option", name=option, exact=True).click()
 
-    def enter(self, label, number):
-        """Type a number."""
+    def enter(self, label, value):
+        """Type a number, or a text."""
         field = self.page.get_by_label(label, exact=True).first
         field.scroll_into_view_if_needed()
-        field.fill(str(number))
+        field.fill(str(value))
         field.press("Enter")
 
     def press(self, label):
@@ -217,10 +217,10 @@ def away(page):
     page.page.wait_for_timeout(3000)
 
 
-def screenshots(config, folder, closer):
+def screenshots(config, folder, closer, masks=None):
     """Pages of `ns-viewer` on a run of several levels, `viewer_*.png`: as it starts, and with each control in use.
 
-    The camera is that of a photograph, moved closer by so many turns of the wheel.
+    The camera is that of a photograph, moved closer by so many turns of the wheel. `masks`: a folder of an object's.
     """
     with sync_playwright() as playwright, Viewer(config, folder / "viewer.log") as viewer:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
@@ -256,8 +256,14 @@ def screenshots(config, folder, closer):
         page.choose("Focus", "click")
         page.place(0.48, 0.5)
         shoot("focus")
+        if masks is not None:
+            page.choose("Focus", "masks")
+            page.enter("Mask folder", masks)
+            page.press("Find the object")
+            wait_until(lambda: "The object has" in page.note(), "the object")
+            shoot("masks")
         browser.close()
 
 
 if __name__ == "__main__":
-    screenshots(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) > 3 else 0)
+    screenshots(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) > 3 else 0, *sys.argv[4:5])

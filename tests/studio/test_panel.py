@@ -3,24 +3,29 @@
 import threading
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from nerfstudio.viewer.viewer_elements import ViewerDropdown
-from running import in_render_thread
+from running import SIZE, in_render_thread
 
 from freqgs_plugin.apps.filters import apply_filter
+from freqgs_plugin.apps.focus import Focus, Selection, vote_in_folder
 from freqgs_plugin.apps.foveation import Foveation
+from freqgs_plugin.apps.gaze import salient_point
 from freqgs_plugin.apps.geometry import GeometryIndex
 from freqgs_plugin.apps.region import Ball
 from freqgs_plugin.functional.attenuation import LevelCut, Product
 from freqgs_plugin.functional.budget import in_view
+from freqgs_plugin.io.images import write_image
 from freqgs_plugin.studio.checkpoint import load_run
 from freqgs_plugin.studio.clicking import Clicks, sight
 from freqgs_plugin.studio.controls import detail_slider, lod_slider
 from freqgs_plugin.studio.filtering import FilterCache
+from freqgs_plugin.studio.masking import Surroundings
 from freqgs_plugin.studio.panel import Panel
-from freqgs_plugin.studio.viewing import show
-from freqgs_plugin.types import Gaussians
+from freqgs_plugin.studio.viewing import SMALL, show
+from freqgs_plugin.types import Camera, Gaussians
 
 pytestmark = pytest.mark.slow
 NOTHING = Gaussians(
@@ -255,6 +260,110 @@ def test_a_click_at_nothing_is_told_and_the_last_focus_stays(run):
     assert torch.equal(shown(run, 1)["rgb"], before) and run.model.controls.note.value == ""
 
 
+def mask_folder(run, folder, size=SIZE, box=((20, 50), (20, 60))):
+    folder.mkdir()
+    (top, bottom), (left, right) = box
+    for view in run.cameras("test"):
+        mask = np.zeros((size[1], size[0]), np.uint8)
+        mask[top:bottom, left:right] = 255
+        write_image(folder / f"{view.name.rsplit('.', 1)[0]}.png", np.repeat(mask[..., None], 3, -1))
+    return folder
+
+
+def search(run, folder):
+    """Name a folder and press the button; what is said at once, and in the end."""
+    panel = run.model.controls
+    panel.masked.folder.value = str(folder)
+    panel.masked.ask()
+    shown(run)
+    first = panel.note.value
+    join_searches()
+    return first, panel.note.value
+
+
+def test_a_focus_by_a_folder_of_masks(run, tmp_path):
+    choose(run, focus="masks")
+    full = shown(run)["rgb"]
+    assert torch.equal(full, drawn(run)), "no folder is named"
+    folder = mask_folder(run, tmp_path / "masks")
+    views = [*run.cameras("train"), *run.cameras("test")]
+    look = {"rasterizer": run.rasterizer, "antialiased": run.antialiased}
+    expected = vote_in_folder(run.gaussians, [v.name for v in views], [v.camera for v in views], folder, **look)
+    first, last = search(run, folder)
+    assert first == f"Looking for the object that the masks in {folder} mark ..."
+    assert last == f"The object has {expected.count:,} Gaussians."
+    picture = shown(run)["rgb"]
+    assert torch.equal(picture, drawn(run, Focus(expected.rows))) and not torch.equal(picture, full)
+
+    bad = {
+        "": "No folder of masks is named",
+        str(tmp_path / "nowhere"): "nowhere is no folder",
+        str(mask_folder(run, tmp_path / "small", (40, 32))): "is 40x32 px, and its view 80x64 px",
+        str(mask_folder(run, tmp_path / "empty", box=((0, 0), (0, 0)))): "are empty",
+        str(mask_folder(run, tmp_path / "dot", box=((0, 1), (0, 1)))): "of none of the",
+    }
+    for name, message in bad.items():
+        said = search(run, name)[1]
+        assert message in said and said.endswith("The last object stays."), said
+        assert torch.equal(shown(run)["rgb"], picture), "the last good state"
+    choose(run, filter="sharp")
+    shown(run)
+    assert "The object was found among" in run.model.controls.note.value
+    choose(run, filter="off", focus="off")
+    assert torch.equal(shown(run)["rgb"], full) and run.model.controls.note.value == ""
+
+
+def test_while_masks_are_searched_the_viewer_draws_and_the_newest_search_counts(run, monkeypatch):
+    go, names = threading.Event(), iter(["slow", "quick"])
+    rows = {name: torch.arange(len(run.gaussians)) % 2 == i for i, name in enumerate(("slow", "quick"))}
+
+    def find(gaussians, *_, **__):
+        name = next(names)
+        if name == "slow":
+            assert go.wait(60)
+        return Selection(rows[name], rows[name].float(), rows[name].float())
+
+    monkeypatch.setattr("freqgs_plugin.studio.masking.vote_in_folder", find)
+    choose(run, focus="masks")
+    panel = run.model.controls
+    panel.masked.folder.value = "a"
+    panel.masked.ask()
+    full = shown(run)["rgb"]
+    assert torch.equal(full, drawn(run)) and panel.note.value.startswith("Looking for")
+    assert "The object has" in search_again(run, "b")
+    go.set()
+    join_searches()
+    assert torch.equal(shown(run)["rgb"], drawn(run, Focus(rows["quick"])))
+
+
+def join_searches(but=0):
+    searches = [thread for thread in threading.enumerate() if "_find" in thread.name]
+    for thread in searches[but:]:
+        thread.join(60)
+
+
+def search_again(run, folder):
+    run.model.controls.masked.folder.value = folder
+    run.model.controls.masked.ask()
+    shown(run)
+    join_searches(but=1)
+    return run.model.controls.note.value
+
+
+def test_the_gaze_goes_to_what_stands_out(run):
+    choose(run, gaze="salient")
+    picture = shown(run)["rgb"]
+    base = drawn(run, LevelCut(1))
+    camera = run.cameras("test")[0].camera
+    factor = SMALL / max(camera.width, camera.height)
+    K = camera.K.clone()
+    K[:2] *= factor
+    large = Camera(camera.viewmat, K, round(camera.width * factor), round(camera.height * factor))
+    small = show(run.model.draw(run.gaussians, large, run.background, LevelCut(1)).features)
+    gaze = salient_point(small.detach().numpy())
+    assert torch.equal(picture, drawn(run, Foveation(gaze))) and not torch.equal(picture, base)
+
+
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.3, -2.0, 0.1), (-5.0, 0.0, 0.0)])
 def test_a_sight_looks_along_the_ray(direction):
     origin = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
@@ -357,7 +466,8 @@ def test_advanced_controls_are_hidden_until_their_mode_is_chosen():
     panel, handles, drawings, _ = installed()
     assert list(handles) == [
         *("Mode", "Level of detail", "Budget (thousands)"),
-        *("Gaze", "Gaze radius", "Move the gaze", "Filter", "Focus", "Focus radius", "Move the focus", "Drawn", "Note"),
+        *("Gaze", "Gaze radius", "Move the gaze", "Filter", "Focus", "Focus radius", "Move the focus"),
+        *("Mask folder", "Find the object", "Drawn", "Note"),
     ]
     assert visible(handles) == ALWAYS | {"Level of detail"}
     handles["Mode"].use("budget")
@@ -369,6 +479,11 @@ def test_advanced_controls_are_hidden_until_their_mode_is_chosen():
     handles["Gaze"].use("click")
     handles["Focus"].use("click")
     assert visible(handles) == ALWAYS | {"Gaze radius", "Move the gaze", "Focus radius", "Move the focus"}
+    handles["Focus"].use("masks")
+    assert visible(handles) == ALWAYS | {"Gaze radius", "Move the gaze", "Mask folder", "Find the object"}
+    handles["Gaze"].use("salient")
+    handles["Focus"].use("off")
+    assert visible(handles) == ALWAYS | {"Gaze radius"}
     panel.say("gaze", "Something.")
     assert handles["Note"].visible and handles["Note"].content == "Something."
     panel.say("focus", "More.")
@@ -390,7 +505,7 @@ def test_without_several_levels_there_is_less_to_choose():
         panel.install(server)
         assert visible(server.handles) - {"Detail scale"} == {"Mode", "Drawn"}
         panel.gaze.value = "middle"
-        assert panel.around(NOTHING) == []
+        assert panel.around(NOTHING, Surroundings(lambda: None, lambda: ([], []), {})) == []
 
 
 def test_the_next_click_of_whoever_asked_places_the_gaze():

@@ -11,6 +11,7 @@ from freqgs_plugin.cli import main
 from freqgs_plugin.io.images import read_image, to_uint8, write_image
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.ply import write_ply
+from freqgs_plugin.reports.contact_sheet import GAP, LABEL
 from freqgs_plugin.studio.checkpoint import load_run
 
 pytestmark = pytest.mark.slow
@@ -78,6 +79,22 @@ def test_a_path_with_budget_gaze_and_filter(trained, tmp_path, render):
     assert "at most 300 Gaussians" in text
 
 
+def test_a_gaze_with_fewer_pixels_is_the_same_where_one_looks(trained, tmp_path, render):
+    gaze = ["--gaze", "0.25,0.5", "--gaze-radius", 0.06, "--gaze-sigma", 0.05, "--size", 320, 256]
+    for name, times in (("plain", []), ("fewer", ["--gaze-scale", 4])):
+        render("--load-config", trained, "--output-dir", tmp_path / name, *gaze, *times)
+    assert [r["drawn"] for r in frames(tmp_path / "plain").values()] == [
+        r["drawn"] for r in frames(tmp_path / "fewer").values()
+    ]
+    for name in frames(tmp_path / "plain"):
+        plain, fewer = (read_image(tmp_path / d / f"{name}.png").astype(int) for d in ("plain", "fewer"))
+        y, x = np.indices(plain.shape[:2]) + 0.5
+        inside = np.hypot(x - 80, y - 128) <= 0.06 * 320
+        # this scene's few Gaussians are large, and the projection holds some within the margin of the smaller image
+        assert np.abs(plain - fewer)[inside].max() <= 8
+        assert (plain != fewer)[:, 200:].any()
+
+
 def test_a_path_shows_what_the_views_show(trained, tmp_path, render):
     run = load_run(trained)
     path = camera_path(run, tmp_path)
@@ -139,8 +156,10 @@ def test_focus_from_masks_and_from_a_box(trained, tmp_path, render):
         (("--budget", "0"), "at least one"),
         (("--gaze", "2,2"), "outside of the image"),
         (("--gaze", "0.5,0.5", "--gaze-sigma", "0"), "sigma is 0"),
+        (("--gaze", "0.5,0.5", "--gaze-scale", "0"), "gaze-scale is 0"),
         (("--size", "0", "5"), "at least 1 px"),
         (("--fps", "0"), "fps is 0"),
+        (("--filter", "pencil"), "filter is 'pencil'"),
         (("--load-config", "RUN", "--path", "nowhere.json"), "nowhere.json is no file"),
         (("--load-config", "RUN", "--path", "RUN"), "is no camera path"),
         (("--load-config", "RUN", "--focus", "nowhere"), "nowhere is no folder"),
@@ -159,3 +178,47 @@ def test_what_cannot_be_drawn_is_said(trained, tmp_path, monkeypatch, capsys, ar
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
     assert not (tmp_path / "renders").exists()
+
+
+OWN = """
+from dataclasses import replace
+
+def dim(gaussians):
+    return replace(gaussians, opacities=gaussians.opacities * 0.5)
+"""
+
+
+def test_a_sheet_of_filters_with_ones_own(trained, tmp_path, monkeypatch, capsys, render):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text(OWN)
+    main(["filters", "--load-config", str(trained), "--filters", "xray", "own.py:dim", "--output", "a/sheet.png"])
+    out = capsys.readouterr().out
+    assert "xray" in out and "dim" in out
+    sheet = read_image(tmp_path / "a" / "sheet.png")
+    assert sheet.shape[1] == 3 * (SIZE[0] + GAP) + GAP and sheet.shape[0] == 3 * (SIZE[1] + LABEL + GAP)
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["sheet.png"]
+    render("--load-config", trained, "--filter", "own.py:dim", "--output-dir", tmp_path / "dim")
+    name = next(iter(frames(tmp_path / "dim")))
+    shown = read_image(tmp_path / "dim" / f"{name}.png")[:, :, :3]
+    in_sheet = [
+        sheet[LABEL + i * (SIZE[1] + LABEL + GAP) :, 2 * SIZE[0] + 3 * GAP :][: SIZE[1], : SIZE[0], :3]
+        for i in range(3)
+    ]
+    assert min(np.abs(shown.astype(int) - picture).max() for picture in in_sheet) <= 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--filters", "pencil"), "filter is 'pencil'"),
+        (("--filters", "nowhere.py:f"), "nowhere.py is no file"),
+        (("--views", "0"), "--views is 0"),
+        (("--views", "99"), "--views is 99, and the run has 9 views"),
+        (("--output", "sheet.jpg"), "the ending .png"),
+    ],
+)
+def test_a_sheet_that_cannot_be_made_is_said(trained, tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(["filters", "--load-config", str(trained), *arguments])
+    assert message in capsys.readouterr().err and not list(tmp_path.iterdir())

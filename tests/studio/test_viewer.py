@@ -5,7 +5,9 @@ import pytest
 import torch
 from browsing import ARGUMENTS, CHROMIUM, Page, Viewer, wait_until
 from playwright.sync_api import sync_playwright
-from running import STEPS
+from running import SIZE, STEPS
+
+from freqgs_plugin.io.images import write_image
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -20,41 +22,53 @@ def chromium():
         browser.close()
 
 
+@pytest.fixture(scope="module")
+def viewer(trained, tmp_path_factory):
+    """One for all tests of this run; each leaves the controls as it has found them."""
+    log = tmp_path_factory.mktemp("viewer") / "viewer.log"
+    with Viewer(trained, log) as viewer:
+        yield viewer
+    text = log.read_text()
+    assert "Traceback" not in text, text
+
+
 def difference(a, b):
     return np.abs(a - b).mean()
 
 
-def test_level_of_detail_in_a_browser(trained, chromium, tmp_path):
-    checkpoint = torch.load(trained.parent / "nerfstudio_models" / f"step-{STEPS - 1:09d}.ckpt", map_location="cpu")
-    counts = torch.bincount(checkpoint["pipeline"]["_model.level"].long())[1:].cumsum(0).tolist()
-    with Viewer(trained, tmp_path / "viewer.log") as viewer:
-        page = Page(chromium, viewer.port)
-        _, everything, _ = page.settled(counts[2])
-        assert everything == counts[2]
-        full = page.picture(tmp_path / "full.png")
-        assert full.std() > 5, "the page shows no picture"
+def counts_of(config):
+    checkpoint = torch.load(config.parent / "nerfstudio_models" / f"step-{STEPS - 1:09d}.ckpt", map_location="cpu")
+    return torch.bincount(checkpoint["pipeline"]["_model.level"].long())[1:].cumsum(0).tolist()
 
-        assert page.slide(0.0) == 1.0
-        page.settled(counts[0])
-        base = page.picture(tmp_path / "base.png")
-        change = difference(full, base)
-        assert change > 2
 
-        assert 1.0 < page.slide(0.5) < 3.0
-        wait_until(lambda: page.drawn() and page.drawn()[0] in counts[1:], "levels in between")
+def test_level_of_detail_in_a_browser(trained, viewer, chromium, tmp_path):
+    counts = counts_of(trained)
+    page = Page(chromium, viewer.port)
+    _, everything, _ = page.settled(counts[2])
+    assert everything == counts[2]
+    full = page.picture(tmp_path / "full.png")
+    assert full.std() > 5, "the page shows no picture"
 
-        assert page.slide(1.0) == 3.0
-        page.settled(counts[2])
-        assert difference(full, page.picture(tmp_path / "again.png")) < change / 2
+    assert page.slide(0.0) == 1.0
+    page.settled(counts[0])
+    base = page.picture(tmp_path / "base.png")
+    change = difference(full, base)
+    assert change > 2
 
-        names = page.choose_output("levels")
-        expected = {"rgb", "depth", "levels", *(f"{kind}_{k}" for kind in ("prefix", "band") for k in (1, 2, 3))}
-        assert expected <= set(names)
-        page.page.wait_for_timeout(3000)
-        assert difference(full, page.picture(tmp_path / "levels.png")) > change / 2
-        page.page.close()
-    log = (tmp_path / "viewer.log").read_text()
-    assert "Traceback" not in log, log
+    assert 1.0 < page.slide(0.5) < 3.0
+    wait_until(lambda: page.drawn() and page.drawn()[0] in counts[1:], "levels in between")
+
+    assert page.slide(1.0) == 3.0
+    page.settled(counts[2])
+    assert difference(full, page.picture(tmp_path / "again.png")) < change / 2
+
+    names = page.choose_output("levels")
+    expected = {"rgb", "depth", "levels", *(f"{kind}_{k}" for kind in ("prefix", "band") for k in (1, 2, 3))}
+    assert expected <= set(names)
+    wait_until(lambda: difference(full, page.look()) > change / 2, "colours by level")
+    page.choose_output("rgb")
+    wait_until(lambda: difference(full, page.look()) < change / 2, "the picture")
+    page.page.close()
 
 
 SAME = 1.2
@@ -80,25 +94,48 @@ def until_it_changes(page, before):
     return still(page)
 
 
-def test_each_control_in_a_browser(trained, chromium, tmp_path):
-    checkpoint = torch.load(trained.parent / "nerfstudio_models" / f"step-{STEPS - 1:09d}.ckpt", map_location="cpu")
-    counts = torch.bincount(checkpoint["pipeline"]["_model.level"].long())[1:].cumsum(0).tolist()
-    with Viewer(trained, tmp_path / "viewer.log") as viewer:
-        page = Page(chromium, viewer.port)
-        page.settled(counts[2])
-        page.press("Hide Train Cams")
-        full = still(page)
+def test_each_control_in_a_browser(trained, viewer, chromium, tmp_path):
+    counts = counts_of(trained)
+    page = Page(chromium, viewer.port)
+    page.settled(counts[2])
+    page.press("Hide Train Cams")
+    full = still(page)
 
-        assert not any(map(page.shows, ("Budget (thousands)", "Gaze radius", "Focus radius", "Move the gaze")))
-        use_modes(page, counts, full)
-        use_gaze(page, counts)
-        use_filters(page, counts)
-        use_focus(page, counts)
-        page.choose("Focus", "off")
-        wait_until(lambda: page.drawn()[0] == counts[2], "everything")
-        page.page.close()
-    log = (tmp_path / "viewer.log").read_text()
-    assert "Traceback" not in log, log
+    assert not any(
+        map(page.shows, ("Budget (thousands)", "Gaze radius", "Focus radius", "Move the gaze", "Mask folder"))
+    )
+    use_modes(page, counts, full)
+    use_gaze(page, counts)
+    use_filters(page, counts)
+    use_focus(page, counts)
+    use_masks(page, counts, tmp_path)
+    page.choose("Focus", "off")
+    wait_until(lambda: page.drawn()[0] == counts[2], "everything")
+    page.page.close()
+
+
+def use_masks(page, counts, folder):
+    """A folder that is not there, and one with a mask: what is found is drawn, and a second mistake changes nothing."""
+    page.choose("Focus", "masks")
+    wait_until(lambda: page.shows("Mask folder"), "the folder's field")
+    page.enter("Mask folder", folder / "nowhere")
+    page.press("Find the object")
+    wait_until(lambda: "nowhere is no folder" in page.note(), "a message")
+    assert page.drawn()[0] == counts[2]
+    (folder / "masks").mkdir()
+    mask = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    mask[10:50, 10:60] = 255
+    for number in (1, 2, 3):
+        write_image(folder / "masks" / f"view_{number:03d}.png", mask)
+    page.enter("Mask folder", folder / "masks")
+    page.press("Find the object")
+    wait_until(lambda: "The object has" in page.note(), "the object")
+    wait_until(lambda: counts[0] < page.drawn()[0] < counts[2], "the object in full")
+    few = page.drawn()[0]
+    page.enter("Mask folder", folder / "nowhere")
+    page.press("Find the object")
+    wait_until(lambda: "The last object stays." in page.note(), "a message")
+    assert page.drawn()[0] == few
 
 
 def use_modes(page, counts, full):
@@ -128,6 +165,8 @@ def use_modes(page, counts, full):
 def use_gaze(page, counts):
     before = still(page)
     page.choose("Gaze", "middle")
+    wait_until(lambda: counts[0] <= page.drawn()[0] < counts[2], "less than everything")
+    page.choose("Gaze", "salient")
     wait_until(lambda: counts[0] <= page.drawn()[0] < counts[2], "less than everything")
     page.choose("Gaze", "click")
     page.place(0.1, 0.1)
@@ -196,8 +235,7 @@ def test_detail_scale_in_a_browser(faded, chromium, tmp_path):
         names = page.choose_output("decay")
         expected = {"rgb", "depth", "decay", "drawn_share", *(f"detail_{s}" for s in ("1", "1.5", "2", "3", "5"))}
         assert expected <= set(names)
-        page.page.wait_for_timeout(3000)
-        assert difference(full, page.picture(tmp_path / "decay.png")) > change / 2
+        wait_until(lambda: difference(full, page.look()) > change / 2, "decays as colours")
         page.page.close()
     log = (tmp_path / "viewer.log").read_text()
     assert "Traceback" not in log, log

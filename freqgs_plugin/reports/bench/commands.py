@@ -84,7 +84,7 @@ def savings(load_config: Path, options: Options = BenchOptions()) -> None:  # no
 
 
 def apps(load_config: Path, options: Options = BenchOptions()) -> None:  # noqa: B008
-    """Measure foveation by image size, and an index of the base against one of everything: time and error.
+    """Measure foveation by image size, filters, and an index of the base against one of everything: time and error.
 
     Args:
         load_config: config.yml of a trained run of several levels.

@@ -198,24 +198,27 @@ def write_all(files: dict[Path, bytes]) -> None:
 
 @contextmanager
 def use_threads(count: int) -> Iterator[None]:
-    """torch and the compiled kernels run on `count` threads inside.
+    """torch, the compiled kernels and OpenCV run on `count` threads inside.
 
     Raises:
         BenchError: numba was started with fewer.
     """
+    import cv2
     import numba
 
     most: int = numba.config.NUMBA_NUM_THREADS  # pyright: ignore
     if count > most:
         raise BenchError(f"--threads {count}: numba has {most} here. Choose fewer, or set NUMBA_NUM_THREADS={count}.")
-    before = torch.get_num_threads(), numba.get_num_threads()
+    before = torch.get_num_threads(), numba.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(count)
     numba.set_num_threads(count)
+    cv2.setNumThreads(count)
     try:
         yield
     finally:
         torch.set_num_threads(before[0])
         numba.set_num_threads(before[1])
+        cv2.setNumThreads(before[2])
 
 
 def _load() -> float | None:
