@@ -63,13 +63,11 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
             _write(new / name, contents)
         if folder.exists():
             os.replace(folder, old)
-        try:
-            os.replace(new, folder)
-        except OSError:
-            if old.exists():
-                os.replace(old, folder)
-            raise
+        os.replace(new, folder)
     finally:
+        # an interrupt, too, may come between the two
+        if old.exists() and not folder.exists():
+            os.replace(old, folder)
         for left in (new, old):
             shutil.rmtree(left, ignore_errors=True)
 

@@ -5,6 +5,9 @@ import shlex
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import UseAppendAction
 
 
 class ReportError(RuntimeError):
@@ -15,8 +18,8 @@ class ReportError(RuntimeError):
 class ReportOptions:
     """Which runs are measured, how, and where the report goes."""
 
-    load_config: tuple[Path, ...]
-    """config.yml of each trained run; all runs have the same held-out views"""
+    load_config: Annotated[tuple[Path, ...], UseAppendAction]
+    """config.yml of a trained run; once for each run. All of them have the same held-out views"""
     names: tuple[str, ...] = ()
     """of the runs, in their order; without them lapsplat, clodsplat or plain"""
     output_dir: Path = Path("report-out")
@@ -37,14 +40,15 @@ class ReportOptions:
 
     def __post_init__(self) -> None:
         if not self.load_config:
-            raise ReportError("there is no run to report on: give --load-config RUN/config.yml, once or more often.")
+            raise ReportError("there is no run to report on: give --load-config RUN/config.yml, once for each run.")
         if self.names and len(self.names) != len(self.load_config):
             raise ReportError(
                 f"--names has {len(self.names)} names for {len(self.load_config)} runs; give one for each, or none."
             )
         twice = [name for name, count in Counter(self.names).items() if count > 1]
         if twice or not all(name.strip() for name in self.names):
-            raise ReportError(f"--names {shlex.join(self.names)}: runs are told apart by their names; make them differ.")
+            named = shlex.join(self.names)
+            raise ReportError(f"--names {named}: runs are told apart by their names; let them differ.")
         if len({path.resolve() for path in self.load_config}) < len(self.load_config):
             raise ReportError("--load-config names a run twice; name each once.")
         if not self.scales or not all(0 < scale < math.inf for scale in self.scales):
