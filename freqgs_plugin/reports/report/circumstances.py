@@ -45,4 +45,7 @@ def _machine(record: Mapping[str, Any]) -> str:
 
 
 def _seeds(record: Mapping[str, Any]) -> str:
-    return ", ".join(f"{run['name']} {seeds(run)}" for run in record["runs"])
+    each = [seeds(run) for run in record["runs"]]
+    if len(set(each)) == 1:
+        return f"{each[0]}{' each' if len(each) > 1 else ''}"
+    return ", ".join(f"{run['name']} {seed}" for run, seed in zip(record["runs"], each, strict=True))

@@ -47,7 +47,7 @@ def measure_report(
         "rounds": options.rounds,
         "load": load,
         "lpips": "computed" if lpips is not None else "not computed",
-        "warnings": list(warnings),
+        "warnings": [*warnings, *_busy(load)],
         "views": _views(runs, pixels),
         "runs": [
             {
@@ -61,6 +61,13 @@ def measure_report(
         ],
     }
     return record, drawn
+
+
+def _busy(load: float | None) -> list[str]:
+    cores = os.cpu_count() or 1
+    if load is None or load <= cores:
+        return []
+    return [f"The machine was busy (load {load:g} on {cores} cores): milliseconds are too long, and compare badly."]
 
 
 def _subsets(of: ReportedRun, options: ReportOptions, bars: Bars) -> list[Subset]:

@@ -34,8 +34,8 @@ def remarks(record: Mapping[str, Any]) -> list[str]:
         if stopped:
             found.append(
                 f"{stopped} step{'s' if stopped > 1 else ''} of {run['name']} took over 100 times the median, "
-                f"{seconds:,.0f} s in all: the trainer was stopped, or compiled its kernels. Its training time is given "
-                "without that."
+                f"{seconds:,.0f} s in all: the trainer was stopped, or compiled its kernels. That is not counted as "
+                "training."
             )
         if what := run["health"]["training"]["what"]:
             found.append(f"First value of {run['name']} that was not finite: {what}.")

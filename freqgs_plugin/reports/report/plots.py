@@ -22,6 +22,8 @@ COSTS: dict[str, tuple[str, str, Cost]] = {
     "error_count": ("count", "Gaussians drawn, thousands", lambda p: p["drawn"] / 1000),
 }
 """file -> what it is called, the axis, and the value"""
+_NAME_WIDTH, _NAME_HEIGHT = 32, 12
+"""of a point's name, pixels"""
 _MARKERS = {"prefixes": "s", "scales": "o", "shares": "^"}
 
 
@@ -50,10 +52,11 @@ def _against(record: Mapping[str, Any], title: str, label: str, cost: Cost) -> "
                 axis.errorbar(x, y, xerr=spread, fmt="none", ecolor=style["color"], elinewidth=0.8, alpha=0.7)
             else:
                 _own_size(axis, points, cost, error, style["color"], text)
-            _name(axis, points, cost, error, style["color"])
         _mark(axis, record, cost, error)
         axis.set(xlabel=label, ylabel=name)
+        axis.margins(x=0.08, y=0.08)
         _logarithmic(axis, [cost(p) for p in points_of(record)])
+        _name(axis, record, cost, error)
     return _finish(figure, axes[0], f"Held-out error against {title}", record)
 
 
@@ -77,14 +80,21 @@ def _own_size(axis: Any, points: Sequence[Point], cost: Cost, error: str, colour
         axis.plot(x, y, color=colour, marker="s", mfc="white", ms=4.5, lw=0.8, ls=":", label=f"{text}, at its own size")
 
 
-def _name(axis: Any, points: Sequence[Point], cost: Cost, error: str, colour: str) -> None:
-    """Levels and scales by name; of cuts, which are many, the first and the last."""
-    named = points if len(points) <= 8 else [points[0], points[-1]]
-    for point in named:
+def _name(axis: Any, record: Mapping[str, Any], cost: Cost, error: str) -> None:
+    """Points by name, the first and the last of each line before the others; none where another name stands."""
+    lines = [(style["color"], points) for _, style, points in _lines(record)]
+    ends = [(colour, point) for colour, points in lines for point in (points[0], points[-1])]
+    between = [(colour, point) for colour, points in lines for point in points[1:-1]]
+    taken: list[Any] = []
+    for colour, point in (*ends, *between):
         place = (cost(point), point[error])
-        if all(math.isfinite(value) for value in place):
+        if not all(math.isfinite(value) for value in place):
+            continue
+        x, y = axis.transData.transform(place)
+        if all(abs(x - left) > _NAME_WIDTH or abs(y - low) > _NAME_HEIGHT for left, low in taken):
+            taken.append((x, y))
             text = point["label"].removeprefix("s_v ")
-            axis.annotate(text, place, (4, 4), textcoords="offset points", fontsize=7, color=colour)
+            axis.annotate(text, place, (5, 5), textcoords="offset points", fontsize=7, color=colour)
 
 
 def _mark(axis: Any, record: Mapping[str, Any], cost: Cost, error: str) -> None:
@@ -128,7 +138,8 @@ def _finish(figure: "Figure", axis: Any, title: str, record: Mapping[str, Any]) 
     handles, labels = axis.get_legend_handles_labels()
     # of what stands in several panels or lines once
     kept = dict(zip(labels, handles, strict=True))
-    figure.legend(kept.values(), kept.keys(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    place = {"loc": "outside lower center", "ncols": 3, "fontsize": 8, "frameon": False}
+    legend = figure.legend(kept.values(), kept.keys(), title=short(record), title_fontsize=6, **place)
+    legend.get_title().set_color(GREY)
     figure.suptitle(title, fontsize=11)
-    figure.supxlabel(short(record), fontsize=6, color=GREY)
     return figure
