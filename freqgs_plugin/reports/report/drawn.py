@@ -27,7 +27,7 @@ class Subset:
     series: str
     """how subsets are chosen; empty where there is one way"""
     label: str
-    value: float
+    value: float | int
     """level, s_v or share"""
     gaussians: Gaussians
     attenuation: Attenuation | None = None

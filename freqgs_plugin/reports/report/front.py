@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+def pareto_front(points: Sequence[tuple[float | int, float | int]]) -> list[int]:
     """Numbers of the points (cost, error) that no other one beats in one and equals or beats in the other, by cost.
 
     Of equal points the first counts. Points that are not finite never do.

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from freqgs_plugin.reports.report.training_log import TrainingLog
 
-THINNEST = torch.finfo(torch.float32).eps ** 0.5
-"""of the longest standard deviation: below, the shortest one's square is lost when float32 adds the longest one's"""
+THINNEST = (torch.finfo(torch.float32).eps / 2) ** 0.5
+"""1/4096 of the longest standard deviation: below, the shortest one's square is lost beside the longest one's"""
 
 
 def health(run: Any, clamped: Mapping[str, Any], log: TrainingLog) -> dict[str, Any]:

@@ -34,9 +34,9 @@ th { border-bottom: 2px solid #888; }
 .note, .circumstances, figcaption { color: #555; font-size: 13px; }
 .plot img { max-width: 100%; height: auto; }
 figure { margin: 0; }
-.views { display: flex; gap: 8px; overflow-x: auto; padding-bottom: 8px; }
-.views figure { flex: none; }
-.views img { display: block; image-rendering: pixelated; }
+.views { display: flex; flex-wrap: wrap; gap: 8px; }
+.views figure { max-width: 100%; }
+.views img { display: block; max-width: 100%; height: auto; }
 ul.remarks { background: #fff6dd; padding: 0.6rem 1rem 0.6rem 2rem; border-left: 4px solid #e69f00; }
 """.strip()
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Point = Mapping[str, Any]
-Cost = Callable[[Point], float]
+Cost = Callable[[Point], float | int]
 
 ERRORS = {"rmse": "RMSE", "1-ssim": "1 - SSIM"}
 COSTS: dict[str, tuple[str, str, Cost]] = {
@@ -105,7 +105,7 @@ def _mark(axis: Any, record: Mapping[str, Any], cost: Cost, error: str) -> None:
     axis.plot(x, y, ls="none", marker="o", ms=10, mfc="none", mec="black", mew=1.0, label="Pareto front")
 
 
-def _logarithmic(axis: Any, values: Sequence[float]) -> None:
+def _logarithmic(axis: Any, values: Sequence[float | int]) -> None:
     positive = [value for value in values if 0 < value < math.inf]
     if positive and max(positive) > 5 * min(positive) and len(positive) == len(values):
         from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter

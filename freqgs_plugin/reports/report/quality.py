@@ -37,7 +37,7 @@ class Errors:
         return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips, "rmse": self.rmse, "1-ssim": 1 - self.ssim}
 
 
-def rmse_of(psnr: float) -> float:
+def rmse_of(psnr: float | int) -> float:
     """Root mean square error in units of full intensity; of a mean PSNR it is the geometric mean over views."""
     return 10 ** (-psnr / 20)
 

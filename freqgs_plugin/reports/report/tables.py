@@ -22,7 +22,7 @@ POINTS_NOTE = (
 HEALTH_NOTE = (
     "*Clamped*: pixels with a colour outside of [0, 1] before clamping, at full detail; *range*: the extremes there. "
     "*Dead decay*: Gaussians whose sigma has come to the bound. *Near-degenerate*: the shortest standard deviation is "
-    "under 1/2896 of the longest, which a float32 covariance cannot hold. *Skipped*: training steps whose loss or "
+    "under 1/4096 of the longest, which a float32 covariance cannot hold. *Skipped*: training steps whose loss or "
     "gradients were not finite."
 )
 
@@ -138,7 +138,7 @@ def seeds(row: Mapping[str, Any]) -> str:
     return str(model) if machine == model else f"{model}, machine {machine}"
 
 
-def _seconds(value: float | None) -> str:
+def _seconds(value: float | int | None) -> str:
     return NONE if value is None else f"{value:.0f} s"
 
 
@@ -146,11 +146,11 @@ def _own(row: Row, name: str, form: str) -> str:
     return NONE if row["own"] is None else format(row["own"][name], form)
 
 
-def _time(render: Mapping[str, float]) -> str:
+def _time(render: Mapping[str, Any]) -> str:
     return f"{number(render['median_ms'])} ({number(render['low_ms'])}-{number(render['high_ms'])})"
 
 
-def _range(clamped: Mapping[str, float]) -> str:
+def _range(clamped: Mapping[str, Any]) -> str:
     return f"{clamped['lowest']:.2f} to {clamped['highest']:.2f}"
 
 

@@ -22,7 +22,7 @@ _LONG = 10.0
 """seconds"""
 _REMEDY = "train with `--vis tensorboard --steps-per-eval-all-images 250`"
 
-Series = Mapping[int, float]
+Series = Mapping[int, float | int]
 """step -> value"""
 
 
