@@ -103,7 +103,8 @@ def test_a_plain_model_is_cut(make_trainer, trained, tmp_path, capsys):
     more = ["--shares", "1", "0.5", "--rounds", "1", "--views", "2", "--docs", str(page)]
     main(["report", *configs(plain, trained), *more, "--output-dir", str(tmp_path / "out")])
     said = capsys.readouterr().out
-    assert "No error against training time for plain: it has no tensorboard log" in said
+    assert "No error against training time for plain: it was not evaluated" in said
+    assert "--steps-per-eval-all-images" in said
     record = json.loads((tmp_path / "out" / "report.json").read_text())
     assert record["views"]["measured"] == 2 and "error_training" not in record["files"]
     opaque, shown = record["runs"][0]["series"]

@@ -21,7 +21,11 @@ from freqgs_plugin.reports.report.options import ReportError
 Kind = Literal["prefixes", "scales", "shares"]
 """what is measured of a run: prefixes of its levels, a sweep of s_v, or cuts of a model of one level"""
 
-_UNREADABLE = (RuntimeError, EOFError, KeyError, TypeError, AttributeError, ImportError, yaml.YAMLError)
+_UNREADABLE = (
+    *(OSError, EOFError, RuntimeError, pickle.UnpicklingError, yaml.YAMLError),
+    *(KeyError, TypeError, AttributeError, ImportError),
+)
+"""what damaged files and those of other versions raise: torch has no one error for them"""
 
 
 @dataclass(frozen=True)
@@ -107,10 +111,11 @@ def _open(path: Path) -> Any:
                 raise ReportError(f"the run {path} has no Gaussians left; there is nothing to report on.")
         return run
     except BenchError as error:
-        raise ReportError(str(error)) from error
-    except (*_UNREADABLE, pickle.UnpicklingError) as error:
-        if isinstance(error, ReportError | torch.cuda.OutOfMemoryError):
-            raise
+        known = str(path) in str(error) or str(path.parent) in str(error)
+        raise ReportError(str(error) if known else f"the run {path} cannot be loaded: {error}") from error
+    except (ReportError, torch.OutOfMemoryError):
+        raise
+    except _UNREADABLE as error:
         reason = " ".join(str(error).split())[:300]
         raise ReportError(
             f"the run {path} cannot be loaded: config.yml or the checkpoint in nerfstudio_models is damaged, or "
