@@ -11,6 +11,7 @@ from freqgs_plugin.commands.options import CommandError, FilterOptions, RenderOp
 from freqgs_plugin.demo.benches import BENCHES as DEMO_BENCHES
 from freqgs_plugin.demo.experiments import EXPERIMENTS
 from freqgs_plugin.reports.bench.commands import BENCHES
+from freqgs_plugin.reports.report.options import ReportError, ReportOptions
 
 
 def demo(
@@ -97,10 +98,22 @@ def stability(
     run_stability(output_dir, only, quick, Console())
 
 
+def report(options: Annotated[ReportOptions, arg(name="")]) -> None:
+    """Compare trained runs: held-out error against render time, bytes, Gaussians and training time, with plots.
+
+    For every prefix of levels (lapsplat), a sweep of s_v (clodsplat) and cuts of a plain model. Writes JSON, CSV,
+    Markdown, PNG plots and one HTML page with all of it, and says whether the runs' numbers are sound.
+    """
+    from freqgs_plugin.commands.report import report_on
+
+    report_on(options)
+
+
 COMMANDS = {
     "demo": demo,
     "render": render,
     "filters": filters,
+    "report": report,
     "stability": stability,
     "bench": {**BENCHES, **DEMO_BENCHES},
     "experiment": EXPERIMENTS,
@@ -164,7 +177,7 @@ def _expected(error: Exception) -> bool:
     from freqgs_plugin.reports.experiments.options import ExperimentError
     from freqgs_plugin.reports.stability.runner import StabilityError
 
-    ours = (CommandError, TrainingError, SceneError, StabilityError, BenchError, ExperimentError)
+    ours = (CommandError, TrainingError, SceneError, StabilityError, BenchError, ExperimentError, ReportError)
     return isinstance(error, (OSError, *ours))
 
 

@@ -342,6 +342,7 @@ class FreqSplatModel(SplatViews):
             "steps_scale": self._scale,
             "sh_degree": self._sh_degree,
             "strategy": {k: self.strategy_state[k] for k in _STATISTICS if self.strategy_state[k] is not None},
+            "guard": self.guard.state(),
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -351,6 +352,7 @@ class FreqSplatModel(SplatViews):
         for key in _STATISTICS:
             value = state["strategy"].get(key)
             self.strategy_state[key] = None if value is None else value.to(self.device)
+        self.guard.load_state(state.get("guard"))
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # pyright: ignore
         if "level" not in dict or "_extra_state" not in dict:

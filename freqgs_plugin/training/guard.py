@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,10 +25,24 @@ class FiniteGuard:
     """consecutive bad steps before training stops"""
     first: str = ""
     """what was wrong at the first bad step; empty where there was none"""
+    first_step: int | None = None
+    """the first bad step; None where there was none"""
     skipped: int = 0
-    """bad steps so far"""
+    """bad steps so far, those before a run was continued included"""
+    complete: bool = True
+    """off: the run was continued from a checkpoint that does not say what happened before"""
     _in_a_row: int = field(default=0, repr=False)
     _bad_losses: list[str] = field(default_factory=list, repr=False)
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        return {"skipped": self.skipped, "first": self.first, "first_step": self.first_step, "complete": self.complete}
+
+    def load_state(self, state: Mapping[str, Any] | None) -> None:
+        """Go on from a checkpoint's `state`; None: it was written before checkpoints kept it."""
+        state = {"complete": False} if state is None else state
+        self.skipped, self.first = int(state.get("skipped", 0)), str(state.get("first", ""))
+        self.first_step, self.complete = state.get("first_step"), bool(state["complete"])
 
     def note_losses(self, losses: Mapping[str, Tensor]) -> None:
         """Remember which parts of this step's loss are not finite."""
@@ -47,7 +62,7 @@ class FiniteGuard:
         self.skipped += 1
         self._in_a_row += 1
         if not self.first:
-            self.first = _describe(params, bad, self._bad_losses, level, step)
+            self.first, self.first_step = _describe(params, bad, self._bad_losses, level, step), step
         for parameter in params.values():
             parameter.grad = None
         if self._in_a_row >= self.patience:

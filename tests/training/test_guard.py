@@ -50,3 +50,16 @@ def test_patience_ends():
         guard.check(params(means=1), LEVEL, step)
     with pytest.raises(NonFiniteError, match=r"3 steps in a row .*step 1: not finite: gradient of 'means'"):
         guard.check(params(means=1), LEVEL, 3)
+
+
+def test_a_continued_run_remembers_its_first_event():
+    guard, again, old = FiniteGuard(), FiniteGuard(), FiniteGuard()
+    guard.check(params(means=0), LEVEL, 4)
+    again.load_state(guard.state())
+    again.check(params(scales=1), LEVEL, 9)
+    assert (again.skipped, again.first_step, again.complete) == (2, 4, True) and again.first == guard.first
+    old.load_state(None)
+    assert (old.skipped, old.first_step, old.complete) == (0, None, False)
+    # once lost, it stays lost
+    again.load_state(old.state())
+    assert not again.complete
