@@ -150,10 +150,17 @@ class Page:
         self.page.get_by_role("option", name=option, exact=True).click()
 
     def enter(self, label, value):
-        """Type a number, or a text."""
+        """Type a number."""
         field = self.page.get_by_label(label, exact=True).first
         field.scroll_into_view_if_needed()
         field.fill(str(value))
+        field.press("Enter")
+
+    def write(self, label, text):
+        """Type a text: viser does not tie the labels of such fields to them."""
+        field = self.page.locator(f'xpath=//*[text()="{label}"]/ancestor::*[.//input][1]//input').first
+        field.scroll_into_view_if_needed()
+        field.fill(str(text))
         field.press("Enter")
 
     def press(self, label):
@@ -258,7 +265,7 @@ def screenshots(config, folder, closer, masks=None):
         shoot("focus")
         if masks is not None:
             page.choose("Focus", "masks")
-            page.enter("Mask folder", masks)
+            page.write("Mask folder", masks)
             page.press("Find the object")
             wait_until(lambda: "The object has" in page.note(), "the object")
             shoot("masks")

@@ -118,7 +118,7 @@ def use_masks(page, counts, folder):
     """A folder that is not there, and one with a mask: what is found is drawn, and a second mistake changes nothing."""
     page.choose("Focus", "masks")
     wait_until(lambda: page.shows("Mask folder"), "the folder's field")
-    page.enter("Mask folder", folder / "nowhere")
+    page.write("Mask folder", folder / "nowhere")
     page.press("Find the object")
     wait_until(lambda: "nowhere is no folder" in page.note(), "a message")
     assert page.drawn()[0] == counts[2]
@@ -127,12 +127,12 @@ def use_masks(page, counts, folder):
     mask[10:50, 10:60] = 255
     for number in (1, 2, 3):
         write_image(folder / "masks" / f"view_{number:03d}.png", mask)
-    page.enter("Mask folder", folder / "masks")
+    page.write("Mask folder", folder / "masks")
     page.press("Find the object")
     wait_until(lambda: "The object has" in page.note(), "the object")
     wait_until(lambda: counts[0] < page.drawn()[0] < counts[2], "the object in full")
     few = page.drawn()[0]
-    page.enter("Mask folder", folder / "nowhere")
+    page.write("Mask folder", folder / "nowhere")
     page.press("Find the object")
     wait_until(lambda: "The last object stays." in page.note(), "a message")
     assert page.drawn()[0] == few
