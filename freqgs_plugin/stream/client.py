@@ -147,7 +147,7 @@ def _fetch_chunks(
                 have = len(chunks) - len(missing)
                 raise StreamError(
                     f"the line to {line.source} broke {breaks} times in a row ({error}); {have} of {len(chunks)} "
-                    "chunks arrived. Try again later; with a folder to keep it in, what has arrived is not fetched again."
+                    "chunks arrived. Try again later; with a folder to keep it, what has arrived is not fetched again."
                 ) from error
             time.sleep(patience.pause * 2 ** (breaks - 1))
 

@@ -142,8 +142,10 @@ def _only(kind: Any, found: Mapping[str, Any]) -> dict[str, Any]:
 
 def _codings(level: Mapping[str, Any]) -> tuple[Coding, ...]:
     lists = ("kept", "low", "step", "centre")
-    found: list[dict[str, Any]] = level["codings"]
-    return tuple(Coding(**{key: tuple(c[key]) if key in lists else c[key] for key in c}) for c in found)
+    return tuple(
+        Coding(**{**coding, **{name: tuple(coding[name]) for name in lists if name in coding}})
+        for coding in level["codings"]
+    )
 
 
 def _contradiction(manifest: Manifest) -> str | None:
