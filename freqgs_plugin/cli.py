@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal, Union
 from tyro.conf import arg
 
 from freqgs_plugin.commands.options import CommandError, RenderOptions
+from freqgs_plugin.commands.serve import serve
+from freqgs_plugin.commands.stream import stream
 from freqgs_plugin.demo.benches import BENCHES as DEMO_BENCHES
 from freqgs_plugin.demo.experiments import EXPERIMENTS
 from freqgs_plugin.reports.bench.commands import BENCHES
@@ -88,6 +90,8 @@ def stability(
 COMMANDS = {
     "demo": demo,
     "render": render,
+    "stream": stream,
+    "serve": serve,
     "stability": stability,
     "bench": {**BENCHES, **DEMO_BENCHES},
     "experiment": EXPERIMENTS,
@@ -150,8 +154,9 @@ def _expected(error: Exception) -> bool:
     from freqgs_plugin.reports.bench.options import BenchError
     from freqgs_plugin.reports.experiments.options import ExperimentError
     from freqgs_plugin.reports.stability.runner import StabilityError
+    from freqgs_plugin.stream.scene import StreamError
 
-    ours = (CommandError, TrainingError, SceneError, StabilityError, BenchError, ExperimentError)
+    ours = (StreamError, CommandError, TrainingError, SceneError, StabilityError, BenchError, ExperimentError)
     return isinstance(error, (OSError, *ours))
 
 

@@ -14,8 +14,8 @@ from urllib.parse import unquote, urlsplit
 PAGE = Path(__file__).parent / "page"
 BLOCK = 4096
 """bytes sent at once"""
-SECURITY = "default-src 'none'; " + "; ".join(
-    f"{kind}-src 'self'" for kind in ("script", "style", "connect", "worker", "img")
+SECURITY = "default-src 'none'; img-src data:; " + "; ".join(
+    f"{kind}-src 'self'" for kind in ("script", "style", "connect", "worker")
 )
 """the page may talk to nobody but its own server"""
 _TYPES: Mapping[str, str] = {

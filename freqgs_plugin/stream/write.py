@@ -55,8 +55,8 @@ def write_stream(scene: StreamScene, folder: Path, options: StreamOptions | None
     """
     stream = encode_stream(scene, options or StreamOptions())
     folder.mkdir(parents=True, exist_ok=True)
-    _replace(folder / stream.manifest.data, stream.data)
-    _replace(folder / MANIFEST, stream.manifest.text().encode())
+    replace_file(folder / stream.manifest.data, stream.data)
+    replace_file(folder / MANIFEST, stream.manifest.text().encode())
     for path in folder.iterdir():
         if DATA.fullmatch(path.name) and path.name != stream.manifest.data:
             path.unlink()
@@ -151,7 +151,8 @@ def _cuts(codings: tuple[Coding, ...], rows: int, cuts: int) -> Iterator[tuple[s
             yield part, first, min(length, rows - first)
 
 
-def _replace(path: Path, contents: bytes) -> None:
+def replace_file(path: Path, contents: bytes) -> None:
+    """Write a file in one piece."""
     partial = path.with_name(f".{path.name}.part")
     try:
         partial.write_bytes(contents)
