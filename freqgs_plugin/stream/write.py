@@ -54,13 +54,22 @@ def write_stream(scene: StreamScene, folder: Path, options: StreamOptions | None
         OSError: the folder cannot be written.
     """
     stream = encode_stream(scene, options or StreamOptions())
+    save_stream(stream, folder)
+    return stream.manifest
+
+
+def save_stream(stream: Stream, folder: Path) -> None:
+    """Write both files, the manifest last; files of an earlier stream are removed.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     replace_file(folder / stream.manifest.data, stream.data)
     replace_file(folder / MANIFEST, stream.manifest.text().encode())
     for path in folder.iterdir():
         if DATA.fullmatch(path.name) and path.name != stream.manifest.data:
             path.unlink()
-    return stream.manifest
 
 
 def encode_stream(scene: StreamScene, options: StreamOptions) -> Stream:
