@@ -8,7 +8,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 from freqgs_plugin.stream.chunks import checksum
 from freqgs_plugin.stream.manifest import MANIFEST, Chunk, Manifest, parse_manifest
@@ -170,7 +170,7 @@ class _Line:
         self._remote = self.source.startswith(("http://", "https://"))
         self._timeout = patience.timeout
 
-    def open(self, name: str, start: int, end: int | None) -> tuple[BinaryIO, int]:
+    def open(self, name: str, start: int, end: int | None) -> tuple[IO[bytes] | http.client.HTTPResponse, int]:
         """The bytes `start` to `end` (exclusive) of a file, and where what is read begins.
 
         Raises:
@@ -215,7 +215,7 @@ class _Line:
                 yield index, data
 
 
-def _exactly(stream: BinaryIO, count: int) -> bytes:
+def _exactly(stream: IO[bytes] | http.client.HTTPResponse, count: int) -> bytes:
     found = bytearray()
     while len(found) < count:
         block = stream.read(count - len(found))

@@ -37,12 +37,10 @@ def importance(
     antialiased: bool,
     attenuation: Attenuation | None = None,
 ) -> Float[Tensor, " n"]:
-    """How early each Gaussian should come among those of its level; without cameras, opacity times size.
+    """How early each Gaussian should come among those of its level.
 
     The time is that of (1 + 2 levels) pictures per camera, about.
     """
-    if not cameras:
-        return _size(gaussians)
     found = torch.zeros_like(gaussians.opacities)
     stride = max(1, -(-len(cameras) // MOST_VIEWS))
     for camera in cameras[::stride]:
@@ -50,8 +48,11 @@ def importance(
     return found
 
 
-def _size(gaussians: Gaussians) -> Float[Tensor, " n"]:
-    """Opacity times the product of the two larger axes: about the area that is covered, from wherever one looks."""
+def size(gaussians: Gaussians) -> Float[Tensor, " n"]:
+    """What stands in for `importance` without cameras: opacity times the product of the two larger axes.
+
+    That is about the area that is covered, from wherever one looks.
+    """
     axes = gaussians.scales.sort(dim=-1).values
     return gaussians.opacities * axes[:, 1] * axes[:, 2]
 

@@ -13,7 +13,7 @@ from freqgs_plugin.functional.attenuation import DistanceDecay
 from freqgs_plugin.rendering.base import get_rasterizer
 from freqgs_plugin.stream.chunks import Columns, checksum, encode_chunk
 from freqgs_plugin.stream.manifest import DATA, MANIFEST, Chunk, Level, Manifest
-from freqgs_plugin.stream.order import importance, streaming_order
+from freqgs_plugin.stream.order import importance, size, streaming_order
 from freqgs_plugin.stream.quantise import NAMES, VARIANTS, Coding, coding_of
 from freqgs_plugin.stream.scene import StreamError, StreamScene
 from freqgs_plugin.types import Camera, Gaussians
@@ -143,6 +143,8 @@ def view_json(name: str, camera: Camera) -> dict[str, Any]:
 
 def _order(scene: StreamScene) -> torch.Tensor:
     gaussians = scene.gaussians
+    if not scene.cameras:
+        return streaming_order(size(gaussians), gaussians.level)
     attenuation = None if gaussians.decay is None else DistanceDecay(1.0, "scene", scene.scene_distance)
     rasterizer = get_rasterizer(scene.rasterizer, gaussians.means.device, absgrad=False)
     options = {"rasterizer": rasterizer, "antialiased": scene.antialiased, "attenuation": attenuation}
