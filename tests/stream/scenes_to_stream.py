@@ -1,6 +1,7 @@
 """Small random scenes of several levels, and servers that do what servers should not."""
 
 import threading
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import ClassVar
@@ -69,8 +70,8 @@ def deaf():
     return Deaf
 
 
-def breaking(after, times):
-    """Closes the line after so many bytes of the file of chunks, so many times."""
+def breaking(after, times, pause=0.0):
+    """Closes the line after so many bytes of the file of chunks and a pause, so many times."""
 
     class Breaking(Recording):
         asked: ClassVar[list] = []
@@ -82,6 +83,7 @@ def breaking(after, times):
             type(self).left -= 1
             super()._send(stream, min(after, count))
             self.wfile.flush()
+            time.sleep(pause)
             self.close_connection = True
             self.connection.shutdown(2)
 
