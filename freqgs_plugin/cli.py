@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal, Union
 from tyro.conf import arg
 
 from freqgs_plugin.commands.options import CommandError, FilterOptions, RenderOptions
+from freqgs_plugin.commands.serve import serve
+from freqgs_plugin.commands.stream import stream
 from freqgs_plugin.demo.benches import BENCHES as DEMO_BENCHES
 from freqgs_plugin.demo.experiments import EXPERIMENTS
 from freqgs_plugin.reports.bench.commands import BENCHES
@@ -114,6 +116,8 @@ COMMANDS = {
     "render": render,
     "filters": filters,
     "report": report,
+    "stream": stream,
+    "serve": serve,
     "stability": stability,
     "bench": {**BENCHES, **DEMO_BENCHES},
     "experiment": EXPERIMENTS,
@@ -176,8 +180,18 @@ def _expected(error: Exception) -> bool:
     from freqgs_plugin.reports.bench.options import BenchError
     from freqgs_plugin.reports.experiments.options import ExperimentError
     from freqgs_plugin.reports.stability.runner import StabilityError
+    from freqgs_plugin.stream.scene import StreamError
 
-    ours = (CommandError, TrainingError, SceneError, StabilityError, BenchError, ExperimentError, ReportError)
+    ours = (
+        CommandError,
+        TrainingError,
+        SceneError,
+        StabilityError,
+        BenchError,
+        ExperimentError,
+        ReportError,
+        StreamError,
+    )
     return isinstance(error, (OSError, *ours))
 
 

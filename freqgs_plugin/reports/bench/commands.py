@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from freqgs_plugin.reports.bench.options import BenchOptions
+from freqgs_plugin.reports.bench.options import BenchError, BenchOptions
 
 Options = Annotated[BenchOptions, tyro.conf.arg(name="")]
 
@@ -99,6 +99,30 @@ def apps(load_config: Path, options: Options = BenchOptions()) -> None:  # noqa:
     run_bench(bench, options, _console(), "--load-config", "RUN/config.yml")
 
 
+def stream(
+    load_config: tuple[Path, ...],
+    names: tuple[str, ...] = (),
+    options: Options = BenchOptions(),  # noqa: B008
+) -> None:
+    """Measure streams of trained runs: error against bytes, pictures by bytes received, seconds on slow lines.
+
+    Args:
+        load_config: config.yml of one or more trained runs.
+        names: what the runs are called in the tables; otherwise as their experiments.
+        options: where to write, and how to measure.
+    """
+    from freqgs_plugin.reports.bench.runner import run_bench
+    from freqgs_plugin.reports.bench.stream import stream_bench
+    from freqgs_plugin.reports.bench.stream_measure import subject_of_run
+
+    if names and len(names) != len(load_config):
+        raise BenchError(f"--names holds {len(names)} names for {len(load_config)} runs; give one for each, or none.")
+    given = names or (None,) * len(load_config)
+    subjects = [subject_of_run(path, name) for path, name in zip(load_config, given, strict=True)]
+    arguments = ["--load-config", *["RUN/config.yml"] * len(load_config), *(["--names", *names] if names else [])]
+    run_bench(stream_bench(options, subjects), options, _console(), *arguments)
+
+
 def _console() -> Any:
     """Tables are not folded to the 80 columns that a file or a pipe would have."""
     from rich.console import Console
@@ -114,5 +138,6 @@ BENCHES = {
     "step": step,
     "savings": savings,
     "apps": apps,
+    "stream": stream,
 }
 """name on the command line -> function"""

@@ -1,0 +1,184 @@
+"""What a stream shows after so many bytes and seconds, against one PLY."""
+
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from freqgs_plugin.functional.attenuation import DistanceDecay
+from freqgs_plugin.io.parameters import RawGaussians
+from freqgs_plugin.io.ply import read_ply, write_ply
+from freqgs_plugin.rendering.base import get_rasterizer
+from freqgs_plugin.rendering.render import render
+from freqgs_plugin.reports.bench.trained import load, views_of, views_of_split
+from freqgs_plugin.reports.drawing import HeldOutView
+from freqgs_plugin.reports.tables import psnr
+from freqgs_plugin.stream.client import fetch
+from freqgs_plugin.stream.manifest import Chunk
+from freqgs_plugin.stream.received import Received
+from freqgs_plugin.stream.scene import StreamScene
+from freqgs_plugin.stream.server import Server
+from freqgs_plugin.stream.write import Stream
+from freqgs_plugin.types import Gaussians
+
+_TENSORS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
+Pictures = list[Float[Tensor, "h w 3"]]
+
+
+@dataclass(frozen=True)
+class StreamSubject:
+    """A scene and the photographs that it is measured on."""
+
+    name: str
+    scene: StreamScene
+    views: Sequence[HeldOutView]
+
+
+@dataclass(frozen=True)
+class Point:
+    """After a chunk."""
+
+    level: int
+    part: str
+    bytes: int
+    """with the manifest"""
+    photographs: float
+    """mean PSNR, dB"""
+    complete: float
+    """mean PSNR against the run's own pictures, dB"""
+    gaussians: int
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds since the request."""
+
+    first: float
+    """something is seen"""
+    base: float
+    """all Gaussians of the base are"""
+    full: float
+
+
+def subject_of_run(config: Path, name: str | None = None) -> StreamSubject:
+    """A trained run with its held-out views, or those trained on where none is held out.
+
+    Raises:
+        BenchError: there is no such run.
+    """
+    run = load(config)
+    g = run.gaussians
+    values = {field: getattr(g, field).detach() for field in _TENSORS}
+    gaussians = replace(g, **values, decay=None if g.decay is None else g.decay.detach())
+    train = [view.camera for view in views_of_split(run, "train")]
+    scene = StreamScene(
+        gaussians, run.background, run.antialiased, run.scene_distance, train, rasterizer=run.rasterizer.name
+    )
+    return StreamSubject(name or run.config.experiment_name, scene, views_of(run))
+
+
+def pictures(subject: StreamSubject, gaussians: Gaussians) -> Pictures:
+    """Of all views, as they are shown."""
+    scene = subject.scene
+    decay = None if gaussians.decay is None else DistanceDecay(1.0, "scene", scene.scene_distance)
+    rasterizer = get_rasterizer(scene.rasterizer, gaussians.means.device, absgrad=False)
+    options = {"rasterizer": rasterizer, "background": scene.background, "antialiased": scene.antialiased}
+    with torch.no_grad():
+        found = [render(gaussians, v.camera, decay, depth=False, **options).features for v in subject.views]
+    return [picture.clamp(0, 1) for picture in found]
+
+
+def quality(found: Pictures, expected: Sequence[Tensor]) -> float:
+    """Mean PSNR, dB."""
+    values = [psnr(a, b.to(a)) for a, b in zip(found, expected, strict=True)]
+    return sum(values) / len(values)
+
+
+def curve(subject: StreamSubject, stream: Stream) -> list[Point]:
+    """After every chunk."""
+    received, own = Received(stream.manifest), pictures(subject, subject.scene.gaussians)
+    photographs = [view.image for view in subject.views]
+    points, begin = [], len(stream.manifest.text())
+    for chunk in stream.manifest.chunks:
+        end = chunk.offset + chunk.bytes
+        received.add(chunk, stream.data[chunk.offset : end])
+        found = pictures(subject, received.gaussians())
+        qualities = quality(found, photographs), quality(found, own)
+        points.append(Point(chunk.level, chunk.part, begin + end, *qualities, received.count))
+    return points
+
+
+def worst_dip(values: Sequence[float]) -> float:
+    """How far a value lies under the best before it, at most; 0 where none does."""
+    best, worst = -float("inf"), 0.0
+    for value in values:
+        worst, best = max(worst, best - value), max(best, value)
+    return worst
+
+
+def ply_of(gaussians: Gaussians, antialiased: bool, path: Path) -> int:
+    """Write the scene as a PLY without normals; its bytes."""
+    raw = RawGaussians(
+        means=gaussians.means,
+        scales=gaussians.scales.log(),
+        quats=gaussians.quats,
+        features_dc=gaussians.features_dc,
+        features_rest=gaussians.features_rest,
+        opacities=gaussians.opacities.clamp(1e-7, 1 - 1e-7).logit()[:, None],
+        level=gaussians.level,
+        decay=gaussians.decay,
+    )
+    write_ply(path, raw, antialiased=antialiased, normals=False)
+    return path.stat().st_size
+
+
+@contextmanager
+def serving(folder: Path, mbits: float | None = None) -> Iterator[str]:
+    """The address of a server for `folder`, at `mbits` Mbit/s."""
+    with Server(folder, mbits=mbits) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield server.url
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def stream_times(folder: Path, mbits: float) -> Times:
+    """Fetch and decode a stream over a slow line."""
+    found: dict[str, float] = {}
+    base: list[tuple[int, str]] = []
+    with serving(folder, mbits) as url:
+        start = time.monotonic()
+
+        def arrived(chunk: Chunk, _bytes: int) -> None:
+            found.setdefault("first", time.monotonic() - start)
+            base.append((chunk.level, chunk.part))
+            # the cores of the base come first
+            if base[-1] == base[0]:
+                found["base"] = time.monotonic() - start
+
+        fetched = fetch(url, arrived=arrived)
+        full = time.monotonic() - start
+    assert fetched.complete
+    return Times(found["first"], found["base"], full)
+
+
+def ply_seconds(path: Path, mbits: float) -> float:
+    """Fetch and read a PLY over a slow line: until then nothing is seen."""
+    with serving(path.parent, mbits) as url:
+        start = time.monotonic()
+        with urllib.request.urlopen(f"{url}/{path.name}") as response:
+            data = response.read()
+        copy = path.with_name("received.ply")
+        copy.write_bytes(data)
+        read_ply(copy)
+        return time.monotonic() - start

@@ -1,0 +1,1 @@
+"""Progressive streaming: a scene as chunks, coarse levels first, of which any number that has arrived is a scene."""
