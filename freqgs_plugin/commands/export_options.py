@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tyro.conf import Positional
+
 
 @dataclass(frozen=True)
 class ExportOptions:
@@ -48,7 +50,7 @@ class ExportOptions:
 class ImportOptions:
     """Which file becomes a run, and where."""
 
-    path: Path
+    path: Positional[Path]
     """splat.ply or splat.spz, or a folder `levels` that freqgs export wrote; other 3DGS PLYs do, too"""
     data: Path | None = None
     """the scene's photographs, as ns-train takes them; without it those that the export names"""
