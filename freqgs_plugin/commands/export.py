@@ -1,6 +1,5 @@
 """`freqgs export`: a trained scene as files for others, each with what it loses against our own pictures."""
 
-import math
 import os
 import shlex
 import time
@@ -113,7 +112,7 @@ def _table(written: list[Written], root: Path, source: Source, options: ExportOp
     def to_ours(shown: Shown | None) -> str:
         if shown is None:
             return "-"
-        return "the same" if math.isinf(shown.to_ours) else f"{shown.to_ours:.2f} dB"
+        return "the same" if shown.same else f"{shown.to_ours:.2f} dB"
 
     def lost(found: Loss | None, shown: Shown | None) -> str:
         return "-" if found is None or shown is None else f"{_plain_zero(found.ours - shown.to_photographs)} dB"
@@ -164,7 +163,7 @@ def _tell(table: BenchTable, source: Source, paths: list[Path], console: "Consol
 
 def _sentence(loss: Loss) -> str:
     def against(shown: Shown) -> str:
-        close = "the same as our pictures" if math.isinf(shown.to_ours) else f"{shown.to_ours:.2f} dB to our pictures"
+        close = "the same as our pictures" if shown.same else f"{shown.to_ours:.2f} dB to our pictures"
         return f"{close}, {_plain_zero(loss.ours - shown.to_photographs)} dB lost against photographs"
 
     if loss.mip is None:

@@ -1,6 +1,5 @@
 """What a written file loses: it is read back, drawn as its consumers draw it, and compared with our own pictures."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,14 +14,23 @@ from freqgs_plugin.reports.tables import psnr
 from freqgs_plugin.types import Camera
 
 
+_SAME = 120.0
+"""dB from which on only rounding differs: a thousandth of what 8 bit can tell"""
+
+
 @dataclass(frozen=True)
 class Shown:
     """Pictures by one kind of viewer."""
 
     to_ours: float
-    """PSNR against our own pictures, dB; infinite: the same"""
+    """PSNR against our own pictures, dB"""
     to_photographs: float
     """PSNR against the photographs, dB"""
+
+    @property
+    def same(self) -> bool:
+        """They differ from our own pictures by rounding only."""
+        return self.to_ours >= _SAME
 
 
 @dataclass(frozen=True)
@@ -48,15 +56,14 @@ class Loss:
         return self.ours - self.best.to_photographs
 
     def json(self) -> dict[str, Any]:
-        """Numbers; null where pictures are the same."""
+        """Numbers; the PSNR is null where pictures are the same."""
 
         def shown(pictures: Shown | None) -> dict[str, Any] | None:
             if pictures is None:
                 return None
-            exact = math.isinf(pictures.to_ours)
             return {
-                "psnr_to_our_pictures": None if exact else round(pictures.to_ours, 3),
-                "same_pictures": exact,
+                "psnr_to_our_pictures": None if pictures.same else round(pictures.to_ours, 3),
+                "same_pictures": pictures.same,
                 "psnr_to_photographs": round(pictures.to_photographs, 3),
                 "psnr_lost": round(self.ours - pictures.to_photographs, 3),
             }
