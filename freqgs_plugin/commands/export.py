@@ -46,7 +46,7 @@ def _export(options: ExportOptions, console: "Console") -> list[Path]:
     check_targets(paths, options.overwrite)
     source = open_source(options)
     chosen.check(source, options)
-    place, page = f"export {source.method} {source.experiment} {options.format}", None
+    place, page = _place(source, options), None
     if options.docs is not None:
         page = options.docs.read_text(encoding="utf-8") if options.docs.is_file() else ""
         check_places(page, [place], options.docs)
@@ -65,6 +65,12 @@ def _export(options: ExportOptions, console: "Console") -> list[Path]:
         write_all({options.docs: fill(page, place, text).encode()})
     _tell(table, source, paths, console)
     return paths
+
+
+def _place(source: Source, options: ExportOptions) -> str:
+    """Name of the table's place in a page."""
+    words = ["export", source.method, source.experiment, options.format, *["baked"] * options.bake]
+    return " ".join([*words, *([] if options.viewer is None else [options.viewer])])
 
 
 def _manifest(
@@ -127,7 +133,7 @@ def _table(written: list[Written], root: Path, source: Source, options: ExportOp
     views = next((item.loss.views for item in written if item.loss is not None), 0)
     return BenchTable(
         name=place,
-        title=f"{source.method}, {source.experiment}, as {options.format}",
+        title=f"{source.method}, {source.experiment}, as {options.format}" + ", baked" * options.bake,
         rows=rows,
         columns=[
             ("file", lambda row: row["name"]),

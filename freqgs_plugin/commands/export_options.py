@@ -43,7 +43,7 @@ class ExportOptions:
     rasterizer: str = "auto"
     """torch, numba, gsplat or auto"""
     docs: Path | None = None
-    """Markdown page to fill: the place `export METHOD EXPERIMENT FORMAT` gets the table"""
+    """Markdown page to fill: the place `export METHOD EXPERIMENT FORMAT` (then `baked`, and the viewer) gets the table"""
 
 
 @dataclass(frozen=True)
