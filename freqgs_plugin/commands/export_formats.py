@@ -90,10 +90,11 @@ def write_as_levels(source: Source, options: ExportOptions, work: Work) -> list[
     names = [f"prefix_{level}.ply" for level in range(1, source.levels + 1)]
     command = streamed_command(names, STREAMED)
     note: dict[str, Any] = {"command": [NAME, *command], "ran": False, "tool": tool_version()}
-    if find_tool() is None:
+    if find_tool() is None or not options.sog:
         work.console.print(f"For PlayCanvas viewers, after `{INSTALL}`, in {LEVELS}/:", soft_wrap=True)
         work.console.print(f"  {NAME} {' '.join(command)}", soft_wrap=True, highlight=False)
     else:
+        work.console.print(f"{NAME} makes a streamed SOG; that may take minutes (--no-sog leaves it out) ...")
         begun = time.perf_counter()
         run_tool(*command, folder=folder)
         note["ran"] = True

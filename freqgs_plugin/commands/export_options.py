@@ -38,6 +38,8 @@ class ExportOptions:
     """steps of that; 0: convert colours only"""
     viewer: Literal["mip", "classic"] | None = None
     """whom to bake for: viewers that heed SplatRenderMode: mip, or those that do not; without it as the run was trained"""
+    sog: bool = True
+    """levels: run splat-transform where it is installed (minutes for a large scene); off: only print its command"""
     seed: int = 0
     """of baking's cameras"""
     rasterizer: str = "auto"
