@@ -146,8 +146,8 @@ def _table(written: list[Written], root: Path, source: Source, options: ExportOp
             ("seconds", lambda row: number(row["written"].seconds)),
             ("Gaussians are", lambda row: row["written"].note),
         ],
-        note=f"Means of PSNR over {views} views. *lost*: what our own pictures reach against the photographs, less what "
-        "the file's reach.",
+        note=f"Means of PSNR over {views} views. *lost*: what our own pictures reach against the photographs, less "
+        "what the file's reach.",
     )
 
 

@@ -13,7 +13,6 @@ from freqgs_plugin.io.plain_ply import read_plain
 from freqgs_plugin.reports.tables import psnr
 from freqgs_plugin.types import Camera
 
-
 _SAME = 120.0
 """dB from which on only rounding differs: a thousandth of what 8 bit can tell"""
 
@@ -109,6 +108,8 @@ def measure_loss(path: Path, source: Source, mip: bool, move: Similarity) -> Los
     scene = read_plain(path, source.scene.background.device)
     cameras = [moved(view.camera, move) for view in source.views]
 
+    photographs = [view.image.to(scene.means) for view in source.views]
+
     def shown(antialiased: bool) -> Shown:
         pictures = []
         for camera in cameras:
@@ -116,10 +117,9 @@ def measure_loss(path: Path, source: Source, mip: bool, move: Similarity) -> Los
                 scene.splats(camera), camera, background=source.scene.background, antialiased=antialiased, depth=False
             )
             pictures.append(rendering.features.clamp(0, 1))
-        photographs = [view.image.to(p) for view, p in zip(source.views, pictures, strict=True)]
         return Shown(_mean_psnr(pictures, source.pictures), _mean_psnr(pictures, photographs))
 
-    ours = _mean_psnr(source.pictures, [view.image.to(p) for view, p in zip(source.views, source.pictures, strict=True)])
+    ours = _mean_psnr(source.pictures, photographs)
     return Loss(len(cameras), ours, shown(True) if mip else None, shown(False))
 
 

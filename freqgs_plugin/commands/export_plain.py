@@ -9,7 +9,7 @@ from freqgs_plugin.commands.export_options import ExportOptions
 from freqgs_plugin.commands.export_source import Source, select
 from freqgs_plugin.functional.fading import faded_logits
 from freqgs_plugin.io.parameters import RawGaussians
-from freqgs_plugin.training.baking import BakeOptions, Baked, bake, signed_refusal, unsigned
+from freqgs_plugin.training.baking import Baked, BakeOptions, bake, signed_refusal, unsigned
 from freqgs_plugin.types import Gaussians
 
 if TYPE_CHECKING:

@@ -35,7 +35,9 @@ def run_import(options: ImportOptions, console: "Console") -> Path:
             dataparser=options.dataparser,
         )
         if options.frame is not None and exported.frame not in (None, options.frame):
-            raise ValueError(f"--frame {options.frame}: {options.path} is in the frame '{exported.frame}', by its JSON.")
+            raise ValueError(
+                f"--frame {options.frame}: by its JSON, {options.path} is in the frame '{exported.frame}'."
+            )
         with quiet():
             config = write_run(exported, settings)
     except ValueError as error:

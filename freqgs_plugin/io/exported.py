@@ -46,7 +46,7 @@ class Exported:
         try:
             return frame_of(self.origin["transform"], self.origin["scale"])
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise SplatFileError(f"the manifest of {self.path} is damaged ({error}); export the scene again.") from error
+            raise SplatFileError(f"the manifest of {self.path} is damaged ({error}); export it again.") from error
 
 
 def read_exported(path: Path) -> Exported:

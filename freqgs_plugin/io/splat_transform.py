@@ -48,7 +48,7 @@ def tool_version() -> str:
 
 
 def streamed_command(prefixes: Sequence[str], output: str) -> list[str]:
-    """Arguments that turn complete scenes, the coarsest first, into one streamed SOG: level of detail 0 is the finest."""
+    """Arguments that turn complete scenes, the coarsest first, into one streamed SOG, whose level 0 is the finest."""
     arguments = ["-w", "-g", "cpu"]
     for lod, name in enumerate(reversed(prefixes)):
         arguments += [name, "-l", str(lod)]

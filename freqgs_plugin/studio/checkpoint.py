@@ -56,9 +56,7 @@ class Run:
     def raw(self) -> RawGaussians:
         """The scene as it is trained; with a decay once that has begun to act."""
         groups, decay = self.model.gauss_params, self.gaussians.decay
-        return RawGaussians(
-            **{name: groups[name].detach() for name in GROUPS}, level=self.gaussians.level, decay=decay
-        )
+        return RawGaussians(**{name: groups[name].detach() for name in GROUPS}, level=self.gaussians.level, decay=decay)
 
     @cached_property
     def frame(self) -> Similarity:

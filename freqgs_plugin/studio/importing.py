@@ -128,7 +128,7 @@ def _pipeline(config: Any, data: Path) -> Any:
         pipeline = config.pipeline.setup(device=device, test_mode="test", world_size=1, local_rank=0)
     except (AssertionError, FileNotFoundError, KeyError, RuntimeError, SystemExit) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise SceneError(f"{data} cannot be read as a scene ({reason}); name the folder that ns-train takes.") from error
+        raise SceneError(f"{data} cannot be read as a scene ({reason}); name what ns-train takes.") from error
     pipeline.eval()
     return pipeline
 

@@ -1,9 +1,8 @@
 """From signed Gaussians, or those that fade with distance, to plain ones that any 3DGS viewer draws the same way.
 
 Signed residuals are colours in [-1, inf). Where such a colour is not negative, harmonics exist of which it is the plain
-colour, exactly (`unsigned`); where it is, viewers draw 0. What is then missing is optimised away against our own
-pictures of the scene (`bake`): mostly by opacities, because a black Gaussian darkens what is behind it as a negative one
-does.
+colour, exactly (`unsigned`); where it is, viewers draw 0. What then differs is optimised away against our own pictures of
+the scene (`bake`), by opacities too: a black Gaussian darkens what is behind it, as a negative one does.
 """
 
 import math
@@ -109,7 +108,7 @@ def bake(
     background: Float[Tensor, " 3"],
     *,
     antialiased: bool,
-    options: BakeOptions = BakeOptions(),  # noqa: B008
+    options: BakeOptions = BakeOptions(),
     on_step: OnStep = lambda done, best: None,
 ) -> Baked:
     """Plain Gaussians whose pictures come close to `picture`, from `start` on.

@@ -45,4 +45,4 @@ def test_folders_are_replaced(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / text).write_text(text)
     put_in_place([tmp_path / "fresh"], [tmp_path / "levels"])
-    assert [p.name for p in tmp_path.iterdir()] == ["levels"] and [p.name for p in (tmp_path / "levels").iterdir()] == ["new"]
+    assert [p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*")] == ["levels", "levels/new"]

@@ -120,4 +120,5 @@ def test_bad_gaussians(change, message):
 
 def test_no_cameras():
     with pytest.raises(ValueError, match="needs training views"):
-        bake(unsigned(signed_scene()), pictures(signed_scene()), [], get_rasterizer("auto", "cpu"), BLACK, antialiased=True)
+        scene, rasterizer = signed_scene(), get_rasterizer("auto", "cpu")
+        bake(unsigned(scene), pictures(scene), [], rasterizer, BLACK, antialiased=True)
