@@ -37,7 +37,7 @@ class ExportOptions:
     bake_steps: int = 400
     """steps of that; 0: convert colours only"""
     viewer: Literal["mip", "classic"] | None = None
-    """whom to bake for: viewers that heed SplatRenderMode: mip, or those that do not; without it as the run is trained"""
+    """whom to bake for: viewers that heed SplatRenderMode: mip, or others; without it as the run is trained"""
     sog: bool = True
     """levels: run splat-transform where it is installed (minutes for a large scene); off: only print its command"""
     seed: int = 0

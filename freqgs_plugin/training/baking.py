@@ -1,8 +1,8 @@
 """From signed Gaussians, or those that fade with distance, to plain ones that any 3DGS viewer draws the same way.
 
 Signed residuals are colours in [-1, inf). Where such a colour is not negative, harmonics exist of which it is the plain
-colour, exactly (`unsigned`); where it is, viewers draw 0. What then differs is optimised away against our own pictures of
-the scene (`bake`), by opacities too: a black Gaussian darkens what is behind it, as a negative one does.
+colour, exactly (`unsigned`); where it is, viewers draw 0. What then differs is optimised away against our own pictures
+of the scene (`bake`), by opacities too: a black Gaussian darkens what is behind it, as a negative one does.
 """
 
 import math
