@@ -46,7 +46,7 @@ def _export(options: ExportOptions, console: "Console") -> list[Path]:
     check_targets(paths, options.overwrite)
     source = open_source(options)
     chosen.check(source, options)
-    place, page = _place(source, options), None
+    place = _place(source, options)
     if options.docs is not None:
         page = options.docs.read_text(encoding="utf-8") if options.docs.is_file() else ""
         check_places(page, [place], options.docs)
@@ -60,8 +60,11 @@ def _export(options: ExportOptions, console: "Console") -> list[Path]:
         write_manifest(beside, manifest)
         table = _table(written, folder / chosen.name, source, options, place)
         put_in_place([folder / path.name for path in paths], paths)
-    if options.docs is not None and page is not None:
+    if options.docs is not None:
         text = "\n\n".join([f"*{table.title}.* {circumstances(record)}", table.markdown(), table.note]) + "\n"
+        # another export may have filled its place meanwhile
+        page = options.docs.read_text(encoding="utf-8")
+        check_places(page, [place], options.docs)
         write_all({options.docs: fill(page, place, text).encode()})
     _tell(table, source, paths, console)
     return paths
