@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Union
 
 from tyro.conf import arg
 
+from freqgs_plugin.commands.export_options import ExportOptions, ImportOptions
 from freqgs_plugin.commands.options import CommandError, FilterOptions, RenderOptions
 from freqgs_plugin.commands.serve import serve
 from freqgs_plugin.commands.stream import stream
@@ -78,6 +79,32 @@ def filters(options: Annotated[FilterOptions, arg(name="")]) -> None:
     run_filters(options, Console())
 
 
+def export(options: Annotated[ExportOptions, arg(name="")] = ExportOptions()) -> None:  # noqa: B008
+    """Write a trained scene as files for other programs, and tell what each loses against our own pictures.
+
+    Files are read back and drawn as viewers draw them, colours clamped at 0, by viewers that heed SplatRenderMode: mip
+    and by those that do not.
+    """
+    from rich.console import Console
+
+    from freqgs_plugin.commands.export import run_export
+
+    run_export(options, Console())
+
+
+def import_(options: Annotated[ImportOptions, arg(name="")]) -> None:
+    """Make a run of an exported scene: ns-eval, ns-viewer, ns-export and freqgs take its config.yml.
+
+    A round trip is exact where the format is.
+    """
+    from rich.console import Console
+
+    from freqgs_plugin.commands.importing import run_import
+
+    run_import(options, Console())
+>>>>>>> export
+
+
 def stability(
     output_dir: Path = Path("stability-out"),
     only: Literal["geometry", "compositing", "decay", "losses", "autocast", "training"] | None = None,
@@ -114,10 +141,13 @@ def report(options: Annotated[ReportOptions, arg(name="")]) -> None:
 COMMANDS = {
     "demo": demo,
     "render": render,
+<<<<<<< HEAD
     "filters": filters,
     "report": report,
     "stream": stream,
     "serve": serve,
+    "export": export,
+    "import": import_,
     "stability": stability,
     "bench": {**BENCHES, **DEMO_BENCHES},
     "experiment": EXPERIMENTS,

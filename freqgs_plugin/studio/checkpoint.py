@@ -10,6 +10,9 @@ from jaxtyping import Float
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
+from freqgs_plugin.functional.similarity import Similarity
+from freqgs_plugin.io.init_source import frame_of
+from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.rendering.base import Rasterizer
 from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.model import FreqSplatModel
@@ -48,6 +51,26 @@ class Run:
         """The scene."""
         with torch.no_grad():
             return self.model.gaussians()
+
+    @cached_property
+    def raw(self) -> RawGaussians:
+        """The scene as it is trained; with a decay once that has begun to act."""
+        groups, decay = self.model.gauss_params, self.gaussians.decay
+        return RawGaussians(**{name: groups[name].detach() for name in GROUPS}, level=self.gaussians.level, decay=decay)
+
+    @cached_property
+    def frame(self) -> Similarity:
+        """From the data set's frame to the scene's."""
+        return frame_of(self._outputs.dataparser_transform, self._outputs.dataparser_scale)
+
+    @property
+    def frame_matrix(self) -> list[list[float]]:
+        """Rotation and translation of `frame`, 3 by 4, as nerfstudio has them."""
+        return self._outputs.dataparser_transform[:3].tolist()
+
+    @property
+    def _outputs(self) -> Any:
+        return self._pipeline.datamanager.train_dataparser_outputs
 
     @property
     def num_levels(self) -> int:

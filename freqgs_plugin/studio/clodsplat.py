@@ -12,8 +12,9 @@ from nerfstudio.utils.colormaps import apply_float_colormap
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from freqgs_plugin.functional.attenuation import Attenuation, DistanceDecay, Reference, frustum_distance, log_decay
+from freqgs_plugin.functional.attenuation import Attenuation, DistanceDecay, Reference, frustum_distance
 from freqgs_plugin.functional.budget import DecayBudget
+from freqgs_plugin.functional.fading import faded_logits
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.rendering.render import render_prefixes
 from freqgs_plugin.studio.config import FreqSplatModelConfig
@@ -32,8 +33,6 @@ from freqgs_plugin.types import Camera, Gaussians, Rendering
 
 _LARGEST_SPEEDUP = 10.0
 """the decays' learning rate is never more than so many times its setting"""
-_FAINTEST = -60.0
-"""least ln(opacity) that is exported; viewers draw nothing under ln(1/255) = -5.5"""
 
 
 @dataclass
@@ -401,11 +400,8 @@ class ClodSplatModel(FreqSplatModel):
         raw = self.gauss_params["opacities"]
         if not self._decays:
             return raw
-        distance = torch.full((self.num_points,), self.config.export_distance, device=raw.device)
-        faded = log_decay(distance, self.gauss_params["decay"].squeeze(-1), 1.0)
-        log_opacity = torch.nn.functional.logsigmoid(raw.squeeze(-1)) + faded
-        # bounded, so that the logit is finite
-        return -torch.expm1(-log_opacity.clamp(_FAINTEST, -1e-7)).log()[:, None]
+        faded = faded_logits(raw.squeeze(-1), self.gauss_params["decay"].squeeze(-1), self.config.export_distance)
+        return faded[:, None]
 
     def _before_export(self) -> None:
         if self._decays:

@@ -20,6 +20,7 @@ from freqgs_plugin.studio.outputs import LazyOutputs
 from freqgs_plugin.studio.panel import Panel
 from freqgs_plugin.studio.targets import ViewTarget
 from freqgs_plugin.studio.viewing import psnr, show
+from freqgs_plugin.training.baking import signed_refusal
 from freqgs_plugin.training.densify import Growth, LevelStrategy, add_level
 from freqgs_plugin.training.objective import pyramid_objective
 from freqgs_plugin.training.schedule import Schedule, scaled
@@ -287,8 +288,4 @@ class LapSplatModel(FreqSplatModel):
 
     def _before_export(self) -> None:
         if self.config.signed_residuals and self._stage > 1:
-            raise ValueError(
-                f"this scene has {self._stage} levels with signed residual colours (in [-1, inf)). A 3DGS PLY cannot "
-                "hold them: viewers clamp each Gaussian's colour at 0, and the picture would be wrong. Train with "
-                "`--pipeline.model.signed-residuals False` to export a scene of several levels."
-            )
+            raise ValueError(signed_refusal(self._stage))

@@ -1,0 +1,55 @@
+"""PlayCanvas's `splat-transform`, where it is installed: SPZ files and streamed SOGs."""
+
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+from freqgs_plugin.io.ply import SplatFileError
+
+NAME = "splat-transform"
+INSTALL = "npm install -g @playcanvas/splat-transform"
+_SECONDS = 1800
+
+
+def find_tool() -> str | None:
+    """The program on the PATH; None where there is none."""
+    return shutil.which(NAME)
+
+
+def run_tool(*arguments: str | Path, folder: Path | None = None) -> None:
+    """Run it in `folder`.
+
+    Raises:
+        SplatFileError: it is not installed, or it failed; the message holds what it said last.
+    """
+    tool = find_tool()
+    if tool is None:
+        raise SplatFileError(f"{NAME} is not on the PATH; install it with `{INSTALL}` (it needs node).")
+    command = [tool, *map(str, arguments)]
+    try:
+        done = subprocess.run(
+            command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise SplatFileError(f"{NAME} was stopped after {_SECONDS} s; the scene may be too large for it.") from error
+    if done.returncode != 0:
+        said = " ".join((done.stderr + done.stdout).split())[-400:]
+        raise SplatFileError(f"`{NAME} {' '.join(command[1:])}` failed with status {done.returncode}: {said}")
+
+
+def tool_version() -> str:
+    """As the tool tells it."""
+    tool = find_tool()
+    if tool is None:
+        return "not installed"
+    done = subprocess.run([tool, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    return (done.stdout + done.stderr).strip().splitlines()[-1] if (done.stdout + done.stderr).strip() else "unknown"
+
+
+def streamed_command(prefixes: Sequence[str], output: str) -> list[str]:
+    """Arguments that turn complete scenes, the coarsest first, into one streamed SOG, whose level 0 is the finest."""
+    arguments = ["-w", "-g", "cpu"]
+    for lod, name in enumerate(reversed(prefixes)):
+        arguments += [name, "-l", str(lod)]
+    return [*arguments, output]
