@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Union
 from tyro.conf import arg
 
 from freqgs_plugin.commands.options import CommandError, RenderOptions
+from freqgs_plugin.commands.trim_options import TrimOptions
 from freqgs_plugin.demo.benches import BENCHES as DEMO_BENCHES
 from freqgs_plugin.demo.experiments import EXPERIMENTS
 from freqgs_plugin.reports.bench.commands import BENCHES
@@ -63,6 +64,19 @@ def render(options: Annotated[RenderOptions, arg(name="")] = RenderOptions()) ->
     run_render(options, Console())
 
 
+def trim(options: Annotated[TrimOptions, arg(name="")]) -> None:
+    """Leave out of a trained run what its scene does not need, and write the rest as a new run beside it.
+
+    Gaussians, harmonics, decays and levels go as far as a stated loss of PSNR on the training views allows; every step
+    is measured, and undone where it costs more. Held-out views are measured too, but nothing is chosen by them.
+    """
+    from rich.console import Console
+
+    from freqgs_plugin.commands.trim import run_trim
+
+    run_trim(options, Console())
+
+
 def stability(
     output_dir: Path = Path("stability-out"),
     only: Literal["geometry", "compositing", "decay", "losses", "autocast", "training"] | None = None,
@@ -88,6 +102,7 @@ def stability(
 COMMANDS = {
     "demo": demo,
     "render": render,
+    "trim": trim,
     "stability": stability,
     "bench": {**BENCHES, **DEMO_BENCHES},
     "experiment": EXPERIMENTS,
