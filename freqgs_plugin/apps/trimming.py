@@ -19,6 +19,8 @@ class Draft:
     gaussians: Gaussians
     rows: Int[Tensor, " n"]
     """which of the run's Gaussians these are"""
+    unseen: tuple[Gaussians, ...] = ()
+    """the same made without looking at the training views of even number, and without those of odd number"""
 
     @classmethod
     def of(cls, gaussians: Gaussians) -> "Draft":
@@ -89,4 +91,4 @@ def decay_never_cuts(margin: Float[Tensor, " n"], without: Float[Tensor, " n"]) 
 
 def without_decay(draft: Draft) -> Draft:
     """The same without distance decay."""
-    return replace(draft, gaussians=replace(draft.gaussians, decay=None))
+    return replace(draft, gaussians=replace(draft.gaussians, decay=None), unseen=())

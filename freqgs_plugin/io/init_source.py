@@ -17,8 +17,8 @@ from torch import Tensor
 
 from freqgs_plugin.functional.harmonics import MAX_DEGREE, num_coefficients
 from freqgs_plugin.functional.similarity import Similarity
-from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.packed import unpack
+from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.ply import SplatFileError, read_ply
 
 TRANSFORMS = "dataparser_transforms.json"

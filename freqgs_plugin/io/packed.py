@@ -1,8 +1,8 @@
 """Parameters of a checkpoint without what says nothing: harmonics of zero, attributes that are all the same.
 
-Rows are sorted by the SH degree that each Gaussian needs, the highest first. The coefficients of band d, [n_d, 2d+1, 3],
-are stored for the first n_d rows alone, as `packed_rest.d`; all others are zero. A tensor whose rows are all equal
-keeps its shape, and is stored as one row: torch writes it so, and reads it again without being told.
+Rows are sorted by the SH degree that each Gaussian needs, the highest first. The coefficients of band d,
+[n_d, 2d+1, 3], are stored for the first n_d rows alone, as `packed_rest.d`; all others are zero. A tensor whose rows
+are all equal keeps its shape, and is stored as one row: torch writes it so, and reads it again without being told.
 """
 
 from collections.abc import Mapping

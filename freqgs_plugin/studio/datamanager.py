@@ -37,6 +37,7 @@ class SceneDatamanager(FullImageDatamanager):
         local_rank: int = 0,
         **kwargs: Any,
     ):
+        self.held_back: set[int] = set()
         parser = config.dataparser
         data = Path(config.data if config.data is not None else parser.data)
         if isinstance(parser, ColmapDataParserConfig):
@@ -45,6 +46,15 @@ class SceneDatamanager(FullImageDatamanager):
             _look_at_transforms(data)
         super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         _look_at_views(self.train_dataset, data)
+
+    def sample_train_cameras(self) -> list[int]:
+        """nerfstudio's order of training views, without those held back."""
+        return [number for number in super().sample_train_cameras() if number not in self.held_back]
+
+    def hold_back(self, views: set[int]) -> None:
+        """Do not train on these views from now on."""
+        self.held_back = set(views)
+        self.train_unseen_cameras = self.sample_train_cameras()
 
 
 def _look_at_colmap(parser: ColmapDataParserConfig, data: Path, thorough: bool) -> None:

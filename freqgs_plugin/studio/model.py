@@ -149,8 +149,8 @@ class FreqSplatModel(SplatViews):
         resumed = self.step > 0
         if resumed and self._trimmed:
             raise ValueError(
-                "this run was written by `freqgs trim`: the state of its optimizers was left out, and training cannot go "
-                "on. Resume the run that it was made from, and trim it again when it has finished."
+                "this run was written by `freqgs trim`: the state of its optimizers was left out, and training cannot "
+                "go on. Resume the run that it was made from, and trim it again when it has finished."
             )
         if not resumed:
             steps = trainer.config.max_num_iterations

@@ -55,9 +55,10 @@ def trimmed_state(run: Run, draft: Draft) -> dict[str, Any]:
     extra["sh_degree"] = min(int(extra["sh_degree"]), sh_degree(draft))
     if "num_levels" in extra:
         extra["stage"] = extra["num_levels"] = len(levels)
+    config: Any = run.model.config
     if gaussians.decay is None and extra.get("decays"):
         extra["decays"] = False
-        model["gauss_params.decay"] = torch.full_like(model["gauss_params.decay"], run.model.config.initial_decay)
+        model["gauss_params.decay"] = torch.full_like(model["gauss_params.decay"], config.initial_decay)
     model["_extra_state"] = extra
     return {**pipeline, **{f"{_MODEL}{name}": _on_cpu(value) for name, value in pack(model).items()}}
 
@@ -90,7 +91,8 @@ class _Counter(io.RawIOBase):
 def checkpoint_bytes(run: Run, draft: Draft) -> int:
     """Size of the checkpoint that `write_trimmed` would write."""
     counter = _Counter()
-    torch.save(checkpoint_of(run, draft), counter)
+    file: Any = counter
+    torch.save(checkpoint_of(run, draft), file)
     return counter.count
 
 

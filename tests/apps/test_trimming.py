@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -79,8 +80,9 @@ def test_from_one_direction_a_constant_is_enough():
     flat = fits.apply(scene, torch.zeros(6, dtype=torch.int64))
     assert flat.features_rest.shape == (6, 0, 3)
     # the ridge keeps a hundredth
-    difference = (seen(flat, camera) - seen(scene, camera)).abs().max()
-    assert difference < 0.05 * (seen(replace(flat, features_dc=scene.features_dc), camera) - seen(scene, camera)).abs().max()
+    cut_off = replace(flat, features_dc=scene.features_dc)
+    fitted, plain = ((seen(g, camera) - seen(scene, camera)).abs().max() for g in (flat, cut_off))
+    assert fitted < 0.05 * plain
 
 
 def test_what_is_missed_is_what_pictures_miss():
@@ -90,7 +92,9 @@ def test_what_is_missed_is_what_pictures_miss():
     fits = fit_harmonics(scene, cameras, weights)
     for degree in range(3):
         lower = fits.apply(scene, torch.full((20,), degree))
-        missed = sum(w * (seen(lower, c) - seen(scene, c)).square().sum(1) for c, w in zip(cameras, weights, strict=True))
+        missed = sum(
+            w * (seen(lower, c) - seen(scene, c)).square().sum(1) for c, w in zip(cameras, weights, strict=True)
+        )
         torch.testing.assert_close(fits.errors[degree], missed, rtol=1e-3, atol=1e-3)
     assert (fits.errors[3] == 0).all() and (fits.errors[0] >= fits.errors[2] - 1e-3).all()
 
@@ -103,7 +107,7 @@ def test_prices_order_degrees():
     assert (fits.degrees_at(low)[:5] == 0).all()
     assert (fits.degrees_at(high) == 0).all()
     chosen = [fits.degrees_at(price) for price in torch.logspace(-8, 3, 12).tolist()]
-    assert all((after <= before).all() for before, after in zip(chosen, chosen[1:], strict=False))
+    assert all((after <= before).all() for before, after in pairwise(chosen))
 
 
 def test_residuals_count_four_times_and_the_unseen_nothing():

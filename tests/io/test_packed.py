@@ -70,7 +70,9 @@ def test_another_order_is_refused():
         pack(state)
 
 
-@pytest.mark.parametrize("spoil", [lambda p: p.pop("packed_rest.1"), lambda p: p.update({"packed_rest.2": torch.ones(1, 4, 3)})])
+@pytest.mark.parametrize(
+    "spoil", [lambda p: p.pop("packed_rest.1"), lambda p: p.update({"packed_rest.2": torch.ones(1, 4, 3)})]
+)
 def test_damage_is_said(spoil):
     packed = pack(state_of([3, 2, 1]))
     spoil(packed)

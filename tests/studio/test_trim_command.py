@@ -96,7 +96,9 @@ def test_ns_eval_reads_it(small, tmp_path):
 def test_other_runs_start_from_it(small):
     source = read_init_source(small, signed_residuals=False).gaussians
     held = load_run(small).model
-    assert torch.equal(source.features_rest, held.gauss_params["features_rest"]) and torch.equal(source.level, held.level)
+    assert torch.equal(source.features_rest, held.gauss_params["features_rest"]) and torch.equal(
+        source.level, held.level
+    )
 
 
 def test_training_does_not_go_on(small, make_trainer):
@@ -107,13 +109,31 @@ def test_training_does_not_go_on(small, make_trainer):
         make_trainer(load_dir=small.parent / "nerfstudio_models", edit=as_there)
 
 
-def test_decays_scales_and_a_page(faded, tmp_path, trim):
+@pytest.fixture
+def spoilt(tmp_path):
+    """`spoilt(config, change)`: config.yml of a copy, after `change` had its checkpoint's pipeline."""
+
+    def copy(config, change):
+        own = Path(shutil.copytree(config.parent, tmp_path / "small" / config.parents[1].name / "run"))
+        for other in sorted((own / "nerfstudio_models").glob("*"))[:-1]:
+            other.unlink()
+        (path,) = (own / "nerfstudio_models").glob("*")
+        content = torch.load(path, weights_only=False)
+        change({name.removeprefix("_model."): value for name, value in content["pipeline"].items()})
+        torch.save(content, path)
+        return own / "config.yml"
+
+    return copy
+
+
+def test_decays_scales_and_a_page(faded, spoilt, tmp_path, trim):
+    run = spoilt(faded, lambda state: state["gauss_params.decay"][::2].fill_(0.3))
     page = tmp_path / "page.md"
     page.write_text("# T\n<!-- trim clodsplat scene -->\n<!-- end of trim clodsplat scene -->\nend\n")
     out = tmp_path / "new" / "clodsplat" / "less"
-    text = trim("--load-config", faded, "--output-dir", out, "--max-loss-db", 0.3, "--docs", page)
+    text = trim("--load-config", run, "--output-dir", out, "--max-loss-db", 0.3, "--docs", page)
     assert str(out / "config.yml") in text and "held-out views, by which nothing was chosen" in text
-    old, new = load_run(faded), load_run(out / "config.yml")
+    old, new = load_run(run), load_run(out / "config.yml")
     for scale in (1.0, 1.5, 2.0, 3.0, 5.0):
         pair = [mean_psnr(run, "train", attenuation=run.model.attenuation(scale)) for run in (old, new)]
         assert pair[1] >= pair[0] - 0.3, scale
@@ -122,40 +142,39 @@ def test_decays_scales_and_a_page(faded, tmp_path, trim):
     assert "decay: kept: up to s_v = 5" in written
 
 
-def test_a_decay_that_never_cuts_goes(faded, tmp_path, trim):
-    own = Path(shutil.copytree(faded.parent, tmp_path / "small" / "clodsplat" / "run"))
-    path = max((own / "nerfstudio_models").glob("*"))
-    content = torch.load(path, weights_only=False)
-    content["pipeline"]["_model.gauss_params.decay"].fill_(1e4)
-    content["pipeline"]["_model.gauss_params.opacities"].fill_(0.5)
-    torch.save(content, path)
-    text = trim("--load-config", own / "config.yml", "--max-loss-db", 0)
+def test_a_decay_that_never_cuts_goes(faded, spoilt, trim):
+    def change(state):
+        state["gauss_params.decay"].fill_(1e4)
+        state["gauss_params.opacities"].fill_(0.5)
+
+    run = spoilt(faded, change)
+    text = trim("--load-config", run, "--max-loss-db", 0)
     assert "never cuts: opacities do not decay any more" in text
-    new = load_run(own.with_name("run-trimmed") / "config.yml")
+    new = load_run(run.parent.with_name("run-trimmed") / "config.yml")
     assert new.gaussians.decay is None and (new.model.gauss_params["opacities"] == 0.5).all()
-    assert mean_psnr(new, "train") == pytest.approx(mean_psnr(load_run(own / "config.yml"), "train"), abs=1e-3)
+    assert mean_psnr(new, "train") == pytest.approx(mean_psnr(load_run(run), "train"), abs=1e-3)
 
 
-def test_dead_gaussians_and_empty_levels_go(trained, tmp_path, trim):
-    own = Path(shutil.copytree(trained.parent, tmp_path / "small" / "lapsplat" / "run"))
-    path = max((own / "nerfstudio_models").glob("*"))
-    content = torch.load(path, weights_only=False)
-    level = content["pipeline"]["_model.level"]
-    content["pipeline"]["_model.gauss_params.opacities"][level == 2] = -9.0
-    torch.save(content, path)
-    held = int((level != 2).sum())
-    text = trim("--load-config", own / "config.yml", "--max-loss-db", 0)
+def test_dead_gaussians_and_empty_levels_go(trained, spoilt, trim):
+    rows = []
+
+    def change(state):
+        rows.append(state["level"] == 2)
+        state["gauss_params.opacities"][rows[0]] = -9.0
+
+    run = spoilt(trained, change)
+    text = trim("--load-config", run, "--max-loss-db", 0)
     assert "level 2 of 3 holds nothing" in text
-    assert f"{int((level == 2).sum()):,} Gaussians of opacity under 1/255" in text
-    new = load_run(own.with_name("run-trimmed") / "config.yml")
-    assert new.num_levels == new.config.pipeline.model.num_levels == 2 and len(new.gaussians) <= held
-    assert set(new.gaussians.level.tolist()) == {1, 2}
-    assert mean_psnr(new, "train") >= mean_psnr(load_run(own / "config.yml"), "train") - 1e-4
+    assert f"{int(rows[0].sum()):,} Gaussians of opacity under 1/255" in text
+    new = load_run(run.parent.with_name("run-trimmed") / "config.yml")
+    assert new.num_levels == new.config.pipeline.model.num_levels == 2
+    assert len(new.gaussians) <= int((~rows[0]).sum()) and set(new.gaussians.level.tolist()) == {1, 2}
+    assert mean_psnr(new, "train") >= mean_psnr(load_run(run), "train") - 1e-4
 
 
 def test_a_dry_run_writes_nothing(trained, tmp_path, trim):
     before = contents(trained.parent)
-    assert "Nothing was written" in trim("--load-config", trained, "--dry-run")
+    assert "Nothing was written" in trim("--load-config", trained, "--dry-run", "--max-loss-db", 0)
     assert contents(trained.parent) == before and not trained.parent.with_name("run-trimmed").exists()
 
 

@@ -106,5 +106,3 @@ def loss(before: Quality, after: Quality) -> tuple[float, str]:
     """The largest loss of PSNR, dB (negative: a gain), and where."""
     where = max(before, key=lambda name: before[name] - after[name])
     return before[where] - after[where], where
-
-

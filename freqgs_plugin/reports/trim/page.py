@@ -10,8 +10,8 @@ from freqgs_plugin.reports.trim.judge import loss
 from freqgs_plugin.reports.trim.steps import Step
 
 NOTE = (
-    "MB: the checkpoint. dB: mean PSNR of the whole scene; lost: the most that it, a prefix of levels or a distance scale "
-    "lost against the run as trained. ms: median of 9 pictures of the first training view, all rows taking turns."
+    "MB: the checkpoint. dB: mean PSNR of the whole scene; lost: the most that it, a prefix of levels or a distance "
+    "scale lost against the run as trained. ms: median of 9 pictures of the first training view, all rows taking turns."
 )
 
 

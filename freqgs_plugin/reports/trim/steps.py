@@ -1,5 +1,6 @@
 """The steps of `freqgs trim`: each leaves something out, is measured, and is undone where it costs too much."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -87,14 +88,27 @@ class Trimmer:
         return self._judge.quality(draft.gaussians, "test", self._held_out) if self._held_out else None
 
     def _fits(self, draft: Draft, allowed: float) -> bool:
-        return loss(self._quick, self._judge.quality(draft.gaussians, "train", self._few))[0] <= allowed
+        quality = self._judge.quality(draft.gaussians, "train", self._few)
+        return max(loss(self._quick, quality)[0], self._unseen_loss(draft, self._few, self._quick)) <= allowed
 
     def _whole_loss(self, draft: Draft) -> tuple[float, Quality]:
         quality = self._judge.quality(draft.gaussians, "train", self._all)
-        return loss(self._whole, quality)[0], quality
+        return max(loss(self._whole, quality)[0], self._unseen_loss(draft, self._all, self._whole)), quality
+
+    def _unseen_loss(self, draft: Draft, views: list[int], before: Quality) -> float:
+        """Of a draft that was fitted to views, on views that its fit did not look at."""
+        if not draft.unseen:
+            return -math.inf
+        sums: dict[str, float] = {}
+        for parity, gaussians in enumerate(draft.unseen):
+            part = [number for number in views if self._all.index(number) % 2 == parity]
+            quality = self._judge.quality(gaussians, "train", part) if part else {}
+            for name, value in quality.items():
+                sums[name] = sums.get(name, 0.0) + value * len(part) / len(views)
+        return loss(before, sums)[0]
 
     def _search(self, name: str, find: Callable[[float], Draft | None]) -> Draft | None:
-        """What `find` makes of the loss allowed so far; with less, where all training views show that it is too much."""
+        """What `find` makes of the loss allowed so far; of less, where all training views show that it costs more."""
         allowed = SHARES[name] * self._allowed
         for _ in range(_RETRIES):
             self._say(f"{name}: as much as costs {allowed:.3g} dB")
@@ -168,10 +182,15 @@ class Trimmer:
             return
         cameras = [self._run.view("train", i).camera for i in self._all]
         fits = fit_harmonics(base.gaussians, cameras, weights)
+        # what a fit is worth where it has not looked: to each half of the views, fitted by the other half alone
+        halves = [self._all[1::2], self._all[::2]] if len(self._all) > 1 else [self._all] * 2
+        others = [fit_harmonics(base.gaussians, [cameras[i] for i in h], [weights[i] for i in h]) for h in halves]
         cap = torch.full((len(base),), degree, device=base.rows.device)
 
         def cut(degrees: Tensor) -> Draft:
-            return replace(base, gaussians=fits.apply(base.gaussians, torch.minimum(degrees, cap)))
+            degrees = torch.minimum(degrees, cap)
+            crossed = tuple(other.apply(base.gaussians, degrees) for other in others)
+            return replace(base, gaussians=fits.apply(base.gaussians, degrees), unseen=crossed)
 
         cap = self._cut_all(cap, degree, cut)
         cap = self._cut_levels(cap, base, cut)
