@@ -54,7 +54,7 @@ def faintest(weight: Float[Tensor, " n"], level: Int[Tensor, " n"], count: int) 
     return drop
 
 
-def most(largest: int, fits: Callable[[int], bool], tries: int = 14) -> int:
+def most(largest: int, fits: Callable[[int], bool], tries: int = 10) -> int:
     """The largest number in 0..`largest` that fits, by bisection: what fits is taken to be an interval from 0.
 
     0 is not tried. At most `tries` numbers are: the answer then is one that fits, up to 2^-tries of `largest` less.
@@ -67,7 +67,7 @@ def most(largest: int, fits: Callable[[int], bool], tries: int = 14) -> int:
     return low
 
 
-def highest(low: float, high: float, fits: Callable[[float], bool], tries: int = 14) -> float | None:
+def highest(low: float, high: float, fits: Callable[[float], bool], tries: int = 9) -> float | None:
     """`most` for a positive number in `low`..`high`, on a logarithmic scale; None if not even `low` fits."""
     if not fits(low):
         return None

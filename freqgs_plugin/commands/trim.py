@@ -12,7 +12,8 @@ from freqgs_plugin.reports.bench.page import check_places, fill
 from freqgs_plugin.reports.bench.trained import load, quiet
 from freqgs_plugin.reports.tables import finite_json
 from freqgs_plugin.reports.trim.page import markdown, place_name, record_of, remarks, summary, trim_table
-from freqgs_plugin.reports.trim.steps import Step, Trimmer
+from freqgs_plugin.reports.trim.steps import trim
+from freqgs_plugin.reports.trim.trimmer import Step, Trimmer
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -57,7 +58,7 @@ def _trim(options: TrimOptions, console: "Console") -> None:
         trimmer = Trimmer(
             run, options.max_loss_db, lambda draft: checkpoint_bytes(run, draft), lambda what: status.update(what)
         )
-        steps = trimmer.trim(checkpoint.stat().st_size)
+        steps = trim(trimmer, checkpoint.stat().st_size)
     _report(run, steps, options, console)
     text = markdown(f"{old.name}, trimmed", steps, options.max_loss_db)
     record = record_of(str(old), run.config.method_name, options.max_loss_db, steps)

@@ -42,7 +42,7 @@ class LevelChoice:
         if most == MOST_LEVELS:
             limit = f"at most {most}"
         bands = f"mean square of each Laplacian band, needed {self.bound:.2e}: {told}" if told else "no band to measure"
-        return f"{self.levels} levels ({limit}). {bands}."
+        return f"{self.levels} level{'s' if self.levels > 1 else ''} ({limit}). {bands}."
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint: numbers, lists and text alone."""

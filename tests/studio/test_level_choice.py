@@ -22,7 +22,7 @@ def test_auto_is_chosen_logged_and_stored(make_trainer, said):
     resumed = make_trainer(load_dir=folder, num_levels="auto", auto_share=100.0)
     again = resumed.pipeline.model
     assert again._num_levels == 3 and again._level_choice == model._level_choice
-    assert again.controls.slider.max_value == 3.0
+    assert again.controls.slider.max == 3.0
     advance(resumed, 1)
     consistent(resumed)
     assert not any("levels (at most" in line for line in said)
@@ -32,7 +32,7 @@ def test_bands_without_energy_get_no_level(make_trainer, said):
     trainer = make_trainer(num_levels="auto", auto_share=1e6)
     model = trainer.pipeline.model
     assert model._num_levels == 1 and model._halvings() == 0
-    assert any(line.startswith("1 levels") and "dropped" in line for line in said)
+    assert any(line.startswith("1 level (") and "dropped" in line for line in said)
     advance(trainer, 1)
 
 

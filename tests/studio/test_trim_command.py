@@ -10,7 +10,7 @@ from running import command
 
 from freqgs_plugin.cli import main
 from freqgs_plugin.io.init_source import read_init_source
-from freqgs_plugin.reports.trim import steps as trim_steps
+from freqgs_plugin.reports.trim import trimmer
 from freqgs_plugin.studio import trimmed
 from freqgs_plugin.studio.checkpoint import load_run
 from freqgs_plugin.studio.viewing import psnr, show
@@ -161,11 +161,13 @@ def test_dead_gaussians_and_empty_levels_go(trained, spoilt, trim):
     def change(state):
         rows.append(state["level"] == 2)
         state["gauss_params.opacities"][rows[0]] = -9.0
+        rows[0][0] = True
+        state["gauss_params.means"][0] = torch.nan
 
     run = spoilt(trained, change)
     text = trim("--load-config", run, "--max-loss-db", 0)
     assert "level 2 of 3 holds nothing" in text
-    assert f"{int(rows[0].sum()):,} Gaussians of opacity under 1/255" in text
+    assert f"{int(rows[0].sum()):,} Gaussians of opacity under 1/255, with a dead decay, or not finite" in text
     new = load_run(run.parent.with_name("run-trimmed") / "config.yml")
     assert new.num_levels == new.config.pipeline.model.num_levels == 2
     assert len(new.gaussians) <= int((~rows[0]).sum()) and set(new.gaussians.level.tolist()) == {1, 2}
@@ -224,7 +226,7 @@ def test_a_full_disk_and_an_interrupt_leave_nothing(trained, tmp_path, monkeypat
             raise failure
 
     monkeypatch.setattr(trimmed.torch, "save", fail)
-    monkeypatch.setattr(trim_steps, "_RETRIES", 0)
+    monkeypatch.setattr(trimmer, "_RETRIES", 0)
     with pytest.raises(SystemExit) as ended:
         main(["trim", "--load-config", str(trained), "--output-dir", str(out)])
     interrupted = isinstance(failure, KeyboardInterrupt)

@@ -7,7 +7,7 @@ from typing import Any
 from freqgs_plugin.reports.bench.tables import BenchTable
 from freqgs_plugin.reports.timing import environment
 from freqgs_plugin.reports.trim.judge import loss
-from freqgs_plugin.reports.trim.steps import Step
+from freqgs_plugin.reports.trim.trimmer import Step
 
 NOTE = (
     "MB: the checkpoint. dB: mean PSNR of the whole scene; lost: the most that it, a prefix of levels or a distance "
