@@ -35,12 +35,19 @@ class Draft:
         return Draft(self.gaussians.select(rows), self.rows[rows])
 
 
+def finite_rows(gaussians: Gaussians) -> Bool[Tensor, " n"]:
+    """Gaussians with numbers in all parameters: others cannot be drawn at all."""
+    g = gaussians
+    columns = [g.means, g.quats, g.scales, g.opacities[:, None], g.features_dc, g.features_rest.flatten(1)]
+    if g.decay is not None:
+        columns.append(g.decay[:, None])
+    return torch.stack([torch.isfinite(column).all(1) for column in columns]).all(0)
+
+
 def never_drawn(gaussians: Gaussians) -> Bool[Tensor, " n"]:
     """What no rasterizer composites, from wherever: opacity under 1/255, a dead decay, values that are not finite."""
     g = gaussians
-    columns = [g.means, g.quats, g.scales, g.opacities[:, None], g.features_dc, g.features_rest.flatten(1)]
-    finite = torch.stack([torch.isfinite(column).all(1) for column in columns]).all(0)
-    dead = ~finite | (g.opacities < TAU) | (g.quats == 0).all(1)
+    dead = ~finite_rows(g) | (g.opacities < TAU) | (g.quats == 0).all(1)
     return dead if g.decay is None else dead | ~(g.decay > 0)
 
 

@@ -167,11 +167,14 @@ def test_dead_gaussians_and_empty_levels_go(trained, spoilt, trim):
     run = spoilt(trained, change)
     text = trim("--load-config", run, "--max-loss-db", 0)
     assert "level 2 of 3 holds nothing" in text
-    assert f"{int(rows[0].sum()):,} Gaussians of opacity under 1/255, with a dead decay, or not finite" in text
+    faint = int(rows[0].sum()) - 1
+    assert f"1 Gaussians that are not finite; {faint:,} Gaussians of opacity under 1/255, or with a dead decay" in text
     new = load_run(run.parent.with_name("run-trimmed") / "config.yml")
     assert new.num_levels == new.config.pipeline.model.num_levels == 2
     assert len(new.gaussians) <= int((~rows[0]).sum()) and set(new.gaussians.level.tolist()) == {1, 2}
-    assert mean_psnr(new, "train") >= mean_psnr(load_run(run), "train") - 1e-4
+    old = load_run(run)
+    held = mean_psnr(old, "train", old.gaussians.select(~rows[0]))
+    assert mean_psnr(new, "train") >= held - 1e-3
 
 
 def test_a_dry_run_writes_nothing(trained, tmp_path, trim):

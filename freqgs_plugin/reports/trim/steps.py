@@ -40,15 +40,16 @@ def remove_never_drawn(t: Trimmer) -> None:
     """Remove what no view from anywhere shows."""
     draft, name = t.draft, "never drawn"
     dead = never_drawn(draft.gaussians)
-    count = int(dead.sum())
+    count, gone = int(dead.sum()), f"{t.not_finite:,} Gaussians that are not finite" if t.not_finite else ""
     if not count or count == len(draft):
-        t.add(name, "no Gaussian is too faint to be drawn, or not finite", None)
+        t.add(name, gone or "no Gaussian is too faint to be drawn, or not finite", None)
         return
     found = draft.keep(~dead)
     if t.whole_loss(found)[0] > 0.02 * t.allowed + 1e-6:
-        t.add(name, "nothing", None, t.would(f"removing {count:,} Gaussians that seem to be dead", found))
+        t.add(name, gone, None, t.would(f"removing {count:,} Gaussians that seem to be dead", found))
         return
-    t.add(name, f"{count:,} Gaussians of opacity under 1/255, with a dead decay, or not finite", found)
+    faint = f"{count:,} Gaussians of opacity under 1/255, or with a dead decay"
+    t.add(name, f"{gone}; {faint}" if gone else faint, found)
 
 
 def remove_hardly_drawn(t: Trimmer, weights: list[Tensor]) -> Tensor:

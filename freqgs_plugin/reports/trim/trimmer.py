@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from freqgs_plugin.apps.trimming import Draft
+from freqgs_plugin.apps.trimming import Draft, finite_rows
 from freqgs_plugin.reports.timing import Timing, interleaved
 from freqgs_plugin.reports.trim.judge import Judge, Quality, loss
 
@@ -51,6 +51,13 @@ class Trimmer:
     def begin(self, old_size: int) -> None:
         """Measure the scene as it is."""
         draft = Draft.of(self.run.gaussians)
+        finite = finite_rows(draft.gaussians)
+        self.not_finite = int((~finite).sum())
+        """Gaussians that are left out before anything is measured, because they cannot be drawn"""
+        if self.not_finite:
+            draft = draft.keep(finite)
+        if not len(draft):
+            raise ValueError("no Gaussian of the run is finite. Name an earlier checkpoint's run, or train again.")
         self.say("the scene as it is")
         self._whole = self.judge.quality(draft.gaussians, "train", self.all)
         self._quick = self.judge.quality(draft.gaussians, "train", self._few)
