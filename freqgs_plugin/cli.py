@@ -11,6 +11,7 @@ from freqgs_plugin.commands.export_options import ExportOptions, ImportOptions
 from freqgs_plugin.commands.options import CommandError, FilterOptions, RenderOptions
 from freqgs_plugin.commands.serve import serve
 from freqgs_plugin.commands.stream import stream
+from freqgs_plugin.commands.trim_options import TrimOptions
 from freqgs_plugin.demo.benches import BENCHES as DEMO_BENCHES
 from freqgs_plugin.demo.experiments import EXPERIMENTS
 from freqgs_plugin.reports.bench.commands import BENCHES
@@ -102,7 +103,19 @@ def import_(options: Annotated[ImportOptions, arg(name="")]) -> None:
     from freqgs_plugin.commands.importing import run_import
 
     run_import(options, Console())
->>>>>>> export
+
+
+def trim(options: Annotated[TrimOptions, arg(name="")]) -> None:
+    """Leave out of a trained run what its scene does not need, and write the rest as a new run beside it.
+
+    Gaussians, harmonics, decays and levels go as far as a stated loss of PSNR on the training views allows; every step
+    is measured, and undone where it costs more. Held-out views are measured too, but nothing is chosen by them.
+    """
+    from rich.console import Console
+
+    from freqgs_plugin.commands.trim import run_trim
+
+    run_trim(options, Console())
 
 
 def stability(
@@ -140,14 +153,14 @@ def report(options: Annotated[ReportOptions, arg(name="")]) -> None:
 
 COMMANDS = {
     "demo": demo,
-    "render": render,
-<<<<<<< HEAD
-    "filters": filters,
     "report": report,
-    "stream": stream,
-    "serve": serve,
+    "render": render,
+    "filters": filters,
+    "trim": trim,
     "export": export,
     "import": import_,
+    "stream": stream,
+    "serve": serve,
     "stability": stability,
     "bench": {**BENCHES, **DEMO_BENCHES},
     "experiment": EXPERIMENTS,

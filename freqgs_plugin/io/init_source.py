@@ -17,6 +17,7 @@ from torch import Tensor
 
 from freqgs_plugin.functional.harmonics import MAX_DEGREE, num_coefficients
 from freqgs_plugin.functional.similarity import Similarity
+from freqgs_plugin.io.packed import unpack
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.ply import SplatFileError, read_ply
 
@@ -146,11 +147,15 @@ def _frame_beside(checkpoint: Path) -> Similarity | None:
 
 
 def _read_checkpoint(path: Path) -> tuple[RawGaussians, int]:
-    content = _load(path)
+    content = load_checkpoint(path)
     if not isinstance(content, dict) or not isinstance(content.get("pipeline"), dict):
         raise SplatFileError(f"{path} is no checkpoint of nerfstudio's trainer: it holds no 'pipeline'. Name another.")
     # distributed training puts `module.` into the names
     tensors = {str(name).replace("module.", ""): value for name, value in content["pipeline"].items()}
+    try:
+        tensors = unpack(tensors, "_model.")
+    except ValueError as error:
+        raise SplatFileError(f"{path}: {error}") from error
     prefix = _PREFIX if f"{_PREFIX}means" in tensors else _OLD_PREFIX
     missing = [name for name in GROUPS if not isinstance(tensors.get(prefix + name), Tensor)]
     if missing:
@@ -176,8 +181,12 @@ def _read_checkpoint(path: Path) -> tuple[RawGaussians, int]:
     return raw, step
 
 
-def _load(path: Path) -> Any:
-    """The checkpoint without running any code in it; memory-mapped, so that optimizer states are not read."""
+def load_checkpoint(path: Path) -> Any:
+    """The checkpoint without running any code in it; memory-mapped, so that optimizer states are not read.
+
+    Raises:
+        SplatFileError: it is truncated, or holds more than tensors and numbers.
+    """
     try:
         with torch.serialization.safe_globals(_numpy_scalars()):
             return torch.load(path, map_location="cpu", weights_only=True, mmap=True)

@@ -99,17 +99,31 @@ class Run:
 
     def cameras(self, split: Literal["train", "test"]) -> list[View]:
         """The views of a split, with their images at full size."""
+        return [self.view(split, index) for index in range(self.num_views(split))]
+
+    def num_views(self, split: Literal["train", "test"]) -> int:
+        """Views of a split."""
+        return len(self._views(split)[0])
+
+    def view(self, split: Literal["train", "test"], index: int) -> View:
+        """One view of a split, with its image at full size."""
+        cached, dataset = self._views(split)
+        image = cached[index]["image"].to(self.model.device)
+        image = image.float() / 255.0 if image.dtype == torch.uint8 else image
+        image = self.model.composite_with_background(image, self.background)
+        camera = to_camera(dataset.cameras[index : index + 1].to(self.model.device))
+        return View(Path(dataset.image_filenames[index]).name, camera, image)
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint holds as `pipeline`."""
+        return self._pipeline.state_dict()
+
+    def _views(self, split: Literal["train", "test"]) -> tuple[Any, Any]:
+        """Cached images, and the data set."""
         manager = self._pipeline.datamanager
-        cached = manager.cached_train if split == "train" else manager.cached_eval
-        dataset = manager.train_dataset if split == "train" else manager.eval_dataset
-        views = []
-        for index, data in enumerate(cached):
-            image = data["image"].to(self.model.device)
-            image = image.float() / 255.0 if image.dtype == torch.uint8 else image
-            image = self.model.composite_with_background(image, self.background)
-            camera = to_camera(dataset.cameras[index : index + 1].to(self.model.device))
-            views.append(View(Path(dataset.image_filenames[index]).name, camera, image))
-        return views
+        if split == "train":
+            return manager.cached_train, manager.train_dataset
+        return manager.cached_eval, manager.eval_dataset
 
 
 def load_run(config_path: Path) -> Run:

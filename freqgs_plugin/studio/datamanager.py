@@ -42,6 +42,7 @@ class SceneDatamanager(FullImageDatamanager):
         local_rank: int = 0,
         **kwargs: Any,
     ):
+        self.held_back: set[int] = set()
         parser = config.dataparser
         data = Path(config.data if config.data is not None else parser.data)
         if isinstance(parser, ColmapDataParserConfig):
@@ -61,6 +62,15 @@ class SceneDatamanager(FullImageDatamanager):
             names += [Path(file).name for file in dataset.image_filenames]
             cameras += [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
         return names, cameras
+
+    def sample_train_cameras(self) -> list[int]:
+        """nerfstudio's order of training views, without those held back."""
+        return [number for number in super().sample_train_cameras() if number not in self.held_back]
+
+    def hold_back(self, views: set[int]) -> None:
+        """Do not train on these views from now on."""
+        self.held_back = set(views)
+        self.train_unseen_cameras = self.sample_train_cameras()
 
 
 def _look_at_colmap(parser: ColmapDataParserConfig, data: Path, thorough: bool) -> None:

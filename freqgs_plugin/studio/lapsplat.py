@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -14,6 +15,7 @@ from freqgs_plugin.functional.pyramid import max_levels, reduce
 from freqgs_plugin.rendering.render import render_prefixes
 from freqgs_plugin.studio.config import FreqSplatModelConfig
 from freqgs_plugin.studio.controls import band_of, level_cut, lod_slider
+from freqgs_plugin.studio.level_gain import LevelGain, view_image
 from freqgs_plugin.studio.model import FreqSplatModel
 from freqgs_plugin.studio.optimizers import restart
 from freqgs_plugin.studio.outputs import LazyOutputs
@@ -21,6 +23,7 @@ from freqgs_plugin.studio.panel import Panel
 from freqgs_plugin.studio.targets import ViewTarget
 from freqgs_plugin.studio.viewing import psnr, show
 from freqgs_plugin.training.baking import signed_refusal
+from freqgs_plugin.training.choose_levels import MOST_LEVELS, choose_levels
 from freqgs_plugin.training.densify import Growth, LevelStrategy, add_level
 from freqgs_plugin.training.objective import pyramid_objective
 from freqgs_plugin.training.schedule import Schedule, scaled
@@ -35,8 +38,16 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """Fields of `lapsplat`. Step constants are for runs of 30,000 steps and scale with the run's length."""
 
     _target: type = field(default_factory=lambda: LapSplatModel)
-    num_levels: int = 3
-    """levels L at the end of training (the paper: 3 or 5); 1 is splatfacto's algorithm"""
+    num_levels: int | Literal["auto"] = 3
+    """levels L at the end of training (the paper: 3 or 5); 1 is splatfacto's algorithm; auto: one for each band of the
+    photographs that holds enough energy (ours)"""
+    auto_psnr: float = 30.0
+    """PSNR whose mean square error is the budget by which num-levels auto judges bands, dB (ours)"""
+    auto_share: float = 0.1
+    """share of that budget which a Laplacian band must hold to get a level (ours)"""
+    least_level_gain: float = 0.0
+    """dB by which a new level must improve training views that are held back for it, or none is added after it, and
+    training goes on at full size; 0: no view is held back (ours)"""
     level_interval: int = 2500
     """K: steps between two new levels (the paper)"""
     refine_pause: int = 300
@@ -90,15 +101,25 @@ class LapSplatModel(FreqSplatModel):
     def _check_config(self) -> None:
         super()._check_config()
         config = self.config
-        if config.num_levels < 1:
-            raise ValueError(f"num_levels is {config.num_levels}; it must be at least 1.")
+        if isinstance(config.num_levels, int) and config.num_levels < 1:
+            raise ValueError(f"num_levels is {config.num_levels}; it must be at least 1, or auto.")
+        for name in ("auto_psnr", "auto_share", "least_level_gain"):
+            if not 0 <= getattr(config, name) < float("inf"):
+                raise ValueError(f"{name} is {getattr(config, name)}; it must be a finite number >= 0.")
         if config.level_interval < 1:
             raise ValueError(f"level_interval is {config.level_interval} steps; it must be at least 1.")
 
     def populate_modules(self) -> None:
         super().populate_modules()
         self._stage = 1
-        self._num_levels = self.config.num_levels
+        self._num_levels = self._most_levels()
+        self._level_choice: dict[str, Any] = {}
+        self._gain = LevelGain()
+
+    def _most_levels(self) -> int:
+        """As many as the config asks for; with auto as many as there may be."""
+        levels = self.config.num_levels
+        return levels if isinstance(levels, int) else MOST_LEVELS
 
     # -- schedule and densification -------------------------------------------------------------------------------
 
@@ -108,12 +129,30 @@ class LapSplatModel(FreqSplatModel):
         return self._stage
 
     def _adapt_to_images(self, height: int, width: int) -> None:
-        self._num_levels = min(self.config.num_levels, max_levels(height, width))
-        if self._num_levels < self.config.num_levels:
+        wanted = self._most_levels()
+        self._num_levels = min(wanted, max_levels(height, width))
+        if self._num_levels < wanted and self.config.num_levels != "auto":
             CONSOLE.log(
-                f"[yellow]{self._num_levels} levels instead of {self.config.num_levels}: "
+                f"[yellow]{self._num_levels} levels instead of {wanted}: "
                 f"with more, images of {width}x{height} px would be trained at under 16 px."
             )
+
+    def _begin_run(self, datamanager: Any) -> None:
+        super()._begin_run(datamanager)
+        config = self.config
+        if config.num_levels == "auto":
+            images = (view_image(self, data) for data in datamanager.cached_train)
+            choice = choose_levels(images, config.auto_psnr, config.auto_share)
+            self._num_levels, self._level_choice = choice.levels, choice.state()
+            CONSOLE.log(choice.text())
+        self.controls.set_slider(lod_slider(self._num_levels), self._num_levels)
+
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:  # pyright: ignore
+        callbacks = super().get_training_callbacks(attributes)
+        if self.config.least_level_gain > 0 and 2 < self._num_levels > self._stage:
+            assert attributes.pipeline is not None
+            self._gain.hold_back(attributes.pipeline.datamanager)
+        return callbacks
 
     def _make_schedule(self) -> Schedule:
         config, s = self.config, self._scale
@@ -140,7 +179,29 @@ class LapSplatModel(FreqSplatModel):
     def _begin_step(self, step: int) -> None:
         super()._begin_step(step)
         while self._stage < self.schedule.stage(step):
-            self._enter_stage(self._stage + 1)
+            if self._last_level_gained():
+                self._enter_stage(self._stage + 1)
+            else:
+                self._num_levels = self._stage
+                self.schedule = self._make_schedule()
+                self._targets.clear()
+            if self._stage == self._num_levels:
+                self._gain.release()
+
+    def _last_level_gained(self) -> bool:
+        """Whether the newest level was worth its while; measured before the next one begins."""
+        if not self._gain.active:
+            return True
+        gain = self._gain.measure(self)
+        if gain is None or gain >= self.config.least_level_gain:
+            return True
+        text = (
+            f"Step {self.step}: level {self._stage} gained {gain:.2f} dB on {self._gain.count} views that were held "
+            f"back, less than {self.config.least_level_gain:g}: no further level of {self._num_levels}."
+        )
+        self._level_choice["stopped"] = text
+        CONSOLE.log(text)
+        return False
 
     def _enter_stage(self, stage: int) -> None:
         restart(self._optimizers, tuple(self.gauss_params), self.config.restart_schedulers)
@@ -214,18 +275,21 @@ class LapSplatModel(FreqSplatModel):
     # -- checkpoints ----------------------------------------------------------------------------------------------
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {**super().get_extra_state(), "stage": self._stage, "num_levels": self._num_levels}
+        ours = {"stage": self._stage, "num_levels": self._num_levels, "level_choice": self._level_choice}
+        return {**super().get_extra_state(), **ours, "level_psnr": self._gain.last}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         super().set_extra_state(state)
         self._stage = int(state["stage"])
         self._num_levels = int(state["num_levels"])
+        self._level_choice = dict(state.get("level_choice", {}))
+        self._gain.last = state.get("level_psnr")
         self.controls.set_slider(lod_slider(self._num_levels), self._num_levels)
 
     # -- pictures, evaluation, export -----------------------------------------------------------------------------
 
     def _make_controls(self) -> Panel:
-        levels = self.config.num_levels
+        levels = self._most_levels()
         return Panel(
             lod_slider(levels), ("prefix", "all", "band", "budget") if levels > 1 else ("all", "budget"), levels
         )

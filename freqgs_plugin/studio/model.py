@@ -12,6 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from freqgs_plugin.functional.image_loss import image_distance, mean_square_as_shown
+from freqgs_plugin.io.packed import unpack
 from freqgs_plugin.rendering.render import rendered_weight
 from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.config import FreqSplatModelConfig
@@ -45,6 +46,7 @@ class FreqSplatModel(SplatViews):
         self._scale = 1.0
         self._info: dict[str, Any] | None = None
         self._step_is_finite = True
+        self._trimmed = False
         self._targets = TargetCache(self.config.target_cache_mb)
         self.strategy = self._make_strategy()
         self.strategy_state: dict[str, Any] = {"scene_scale": 1.0, **dict.fromkeys(_STATISTICS)}
@@ -145,6 +147,11 @@ class FreqSplatModel(SplatViews):
         assert trainer is not None and optimizers is not None and attributes.pipeline is not None
         cameras = attributes.pipeline.datamanager.train_dataset.cameras  # pyright: ignore
         resumed = self.step > 0
+        if resumed and self._trimmed:
+            raise ValueError(
+                "this run was written by `freqgs trim`: the state of its optimizers was left out, and training cannot "
+                "go on. Resume the run that it was made from, and trim it again when it has finished."
+            )
         if not resumed:
             steps = trainer.config.max_num_iterations
             self._scale = self.config.steps_scale or steps / REFERENCE_STEPS
@@ -341,6 +348,7 @@ class FreqSplatModel(SplatViews):
             "step": self.step,
             "steps_scale": self._scale,
             "sh_degree": self._sh_degree,
+            "trimmed": self._trimmed,
             "strategy": {k: self.strategy_state[k] for k in _STATISTICS if self.strategy_state[k] is not None},
             "guard": self.guard.state(),
         }
@@ -349,6 +357,7 @@ class FreqSplatModel(SplatViews):
         self.step = int(state["step"])
         self._scale = float(state["steps_scale"])
         self._sh_degree = int(state["sh_degree"])
+        self._trimmed = bool(state.get("trimmed", False))
         for key in _STATISTICS:
             value = state["strategy"].get(key)
             self.strategy_state[key] = None if value is None else value.to(self.device)
@@ -360,6 +369,7 @@ class FreqSplatModel(SplatViews):
                 "the checkpoint holds no levels: it was not made by this method. "
                 "Load it with the method that made it (see `method_name` in its config.yml)."
             )
+        dict = unpack(dict)
         prefix = "gauss_params."
         groups = {key.removeprefix(prefix) for key in dict if key.startswith(prefix)}
         if groups != set(self.gauss_params):

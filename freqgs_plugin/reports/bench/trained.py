@@ -15,7 +15,7 @@ from freqgs_plugin.reports.bench.workloads import Workload, image_gradient
 
 
 def load(config_path: Path) -> Any:
-    """`studio.checkpoint.load_run` without nerfstudio's remarks.
+    """`studio.checkpoint.load_run` without nerfstudio's remarks. nerfstudio asserts that the data is there.
 
     Raises:
         BenchError: there is no such run, or it is of another method.
@@ -25,7 +25,7 @@ def load(config_path: Path) -> Any:
             from freqgs_plugin.studio.checkpoint import load_run
 
             return load_run(config_path)
-    except (FileNotFoundError, ValueError) as error:
+    except (FileNotFoundError, ValueError, AssertionError) as error:
         raise BenchError(str(error)) from error
     except SystemExit as error:
         raise BenchError(f"nerfstudio could not load {config_path}; `ns-eval --load-config` tells why") from error

@@ -1,0 +1,77 @@
+"""lapsplat with a number of levels that it chooses itself, and with levels that must gain something."""
+
+import pytest
+import torch
+from running import advance, save
+from state import consistent
+
+from freqgs_plugin.training.schedule import scaled
+
+pytestmark = pytest.mark.slow
+
+
+def test_auto_is_chosen_logged_and_stored(make_trainer, said):
+    trainer = make_trainer(num_levels="auto", auto_share=0.0)
+    model = trainer.pipeline.model
+    assert model._num_levels == 3 and model._level_choice["kept"] == [True, True]
+    assert any("3 levels (at most 3, since images of 80x64 px" in line for line in said)
+    advance(trainer, 2)
+    folder = save(trainer)
+    said.clear()
+    # without auto's budget: the checkpoint says it
+    resumed = make_trainer(load_dir=folder, num_levels="auto", auto_share=100.0)
+    again = resumed.pipeline.model
+    assert again._num_levels == 3 and again._level_choice == model._level_choice
+    assert again.controls.slider.max == 3.0
+    advance(resumed, 1)
+    consistent(resumed)
+    assert not any("levels (at most" in line for line in said)
+
+
+def test_bands_without_energy_get_no_level(make_trainer, said):
+    trainer = make_trainer(num_levels="auto", auto_share=1e6)
+    model = trainer.pipeline.model
+    assert model._num_levels == 1 and model._halvings() == 0
+    assert any(line.startswith("1 level (") and "dropped" in line for line in said)
+    advance(trainer, 1)
+
+
+@pytest.mark.parametrize(("least", "levels"), [(1000.0, 2), (1e-6, 3)])
+def test_a_level_that_gains_little_is_the_last(make_trainer, said, least, levels):
+    trainer = make_trainer(least_level_gain=least, steps_scale=0.002)
+    model, manager = trainer.pipeline.model, trainer.pipeline.datamanager
+    # of six views none would be
+    assert any("fewer than 8 views" in line for line in said) and not manager.held_back
+    manager.hold_back({1, 4})
+    model._gain._manager = manager
+    stage = scaled(2500, 0.002)
+    with torch.no_grad():
+        # what the second level gains is decided here
+        model._gain.measure = lambda m: None if m._stage == 1 else 1.0
+    seen = []
+    advance(trainer, 2 * stage + 2, before=lambda step: seen.append(set(manager.train_unseen_cameras) & {1, 4}))
+    assert model._stage == model._num_levels == model.num_levels == levels
+    assert not any(seen[: 2 * stage - 1]) and not manager.held_back
+    assert model._halvings() == 0
+    assert ("stopped" in model._level_choice) == (levels == 2)
+    assert any("gained 1.00 dB on 2 views" in line for line in said) == (levels == 2)
+    consistent(trainer)
+
+
+def test_gains_are_differences_of_psnr(make_trainer):
+    from freqgs_plugin.studio.level_gain import LevelGain
+
+    trainer = make_trainer()
+    model, gain = trainer.pipeline.model, LevelGain()
+    trainer.pipeline.datamanager.hold_back({2})
+    gain._manager = trainer.pipeline.datamanager
+    assert gain.measure(model) is None and gain.last is not None
+    assert gain.measure(model) == pytest.approx(0.0, abs=1e-6) and model.training
+    gain.release()
+    assert not gain.active and 2 in trainer.pipeline.datamanager.train_unseen_cameras
+
+
+@pytest.mark.parametrize("name", ["auto_psnr", "auto_share", "least_level_gain"])
+def test_impossible_settings(make_trainer, name):
+    with pytest.raises(ValueError, match=f"{name} is nan"):
+        make_trainer(**{name: float("nan")})
