@@ -82,8 +82,9 @@ def _pictures(record: Mapping[str, Any], drawn: Sequence[Sequence[Subset]], numb
         figures = [photo, *(_drawn_figure(subset, point, number) for subset, point in shown)]
         way = f", {OPAQUE}" if run["kind"] == "shares" else ""
         rows.append(f"<h3>{_text(run['name'] + way)}</h3><div class='views'>{''.join(figures)}</div>")
-    kept = "as they are" if first.image.shape[0] * first.image.shape[1] <= _LOSSLESS else "as JPEG"
-    rows.append(f'<p class="note">Pictures shrink to fit; each is kept {kept}. Figures are means over all views.</p>')
+    kept = "PNG, as it is" if first.image.shape[0] * first.image.shape[1] <= _LOSSLESS else "JPEG"
+    note = f"Pictures shrink to fit; each is kept as {kept}. Figures are means over all views."
+    rows.append(f'<p class="note">{note}</p>')
     return "\n".join(rows)
 
 
