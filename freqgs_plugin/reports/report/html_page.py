@@ -35,7 +35,7 @@ th { border-bottom: 2px solid #888; }
 .plot img { max-width: 100%; height: auto; }
 figure { margin: 0; }
 .views { display: flex; flex-wrap: wrap; gap: 8px; }
-.views figure { max-width: 100%; }
+.views figure { flex: 1 1 300px; }
 .views img { display: block; max-width: 100%; height: auto; }
 ul.remarks { background: #fff6dd; padding: 0.6rem 1rem 0.6rem 2rem; border-left: 4px solid #e69f00; }
 """.strip()
@@ -82,8 +82,9 @@ def _pictures(record: Mapping[str, Any], drawn: Sequence[Sequence[Subset]], numb
         figures = [photo, *(_drawn_figure(subset, point, number) for subset, point in shown)]
         way = f", {OPAQUE}" if run["kind"] == "shares" else ""
         rows.append(f"<h3>{_text(run['name'] + way)}</h3><div class='views'>{''.join(figures)}</div>")
-    kept = "as they are" if first.image.shape[0] * first.image.shape[1] <= _LOSSLESS else "as JPEG"
-    rows.append(f'<p class="note">Pixels are not resampled, and kept {kept}. Figures are means over all views.</p>')
+    kept = "PNG, as it is" if first.image.shape[0] * first.image.shape[1] <= _LOSSLESS else "JPEG"
+    note = f"Pictures shrink to fit; each is kept as {kept}. Figures are means over all views."
+    rows.append(f'<p class="note">{note}</p>')
     return "\n".join(rows)
 
 
@@ -106,7 +107,7 @@ def _drawn_figure(subset: Subset, point: Mapping[str, Any], number: int) -> str:
 def _figure(picture: UInt8[np.ndarray, "h w 3"], name: str, text: str) -> str:
     height, width = picture.shape[:2]
     return (
-        f'<figure><img src="{_encoded(picture)}" width="{width}" height="{height}" alt="{_text(name)}">'
+        f'<figure style="max-width: {width}px"><img src="{_encoded(picture)}" width="{width}" height="{height}" alt="{_text(name)}">'
         f"<figcaption><b>{_text(name)}</b><br>{_text(text)}</figcaption></figure>"
     )
 
