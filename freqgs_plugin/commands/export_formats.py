@@ -94,7 +94,9 @@ def write_as_levels(source: Source, options: ExportOptions, work: Work) -> list[
         work.console.print(f"For PlayCanvas viewers, after `{INSTALL}`, in {LEVELS}/:", soft_wrap=True)
         work.console.print(f"  {NAME} {' '.join(command)}", soft_wrap=True, highlight=False)
     else:
-        work.console.print(f"{NAME} makes a streamed SOG; that may take minutes (--no-sog leaves it out) ...")
+        work.console.print(
+            f"{NAME} makes a streamed SOG; that may take minutes (--no-sog leaves it out) ...", soft_wrap=True
+        )
         begun = time.perf_counter()
         run_tool(*command, folder=folder)
         note["ran"] = True

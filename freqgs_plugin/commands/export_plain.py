@@ -105,6 +105,9 @@ def _activated(raw: RawGaussians, like: Gaussians) -> Gaussians:
 def _bake(start: Gaussians, source: Source, options: ExportOptions, console: "Console", what: str) -> Baked:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    # how much a classic viewer thickens small Gaussians depends on the size of the picture
+    mip = viewer_of(source, options) == "mip"
+    small = 0.5 if mip == source.scene.antialiased else 0.0
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"Baking {what}".strip(), total=options.bake_steps)
@@ -114,8 +117,8 @@ def _bake(start: Gaussians, source: Source, options: ExportOptions, console: "Co
             source.cameras,
             source.scene.rasterizer,
             source.scene.background,
-            antialiased=viewer_of(source, options) == "mip",
-            options=BakeOptions(options.bake_steps, options.seed),
+            antialiased=mip,
+            options=BakeOptions(options.bake_steps, options.seed, small=small),
             on_step=lambda done, best: bar.update(task, completed=done, description=f"Baking {what}: {best:.1f} dB"),
         )
 
