@@ -10,9 +10,9 @@ from scene_page import ScenePage, agreement, ours
 from scenes_to_stream import breaking, damaging, deaf, served, small_scene, stalling
 
 from freqgs_plugin.stream.client import fetch
+from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.html import write_html
 from freqgs_plugin.stream.manifest import MANIFEST
-from freqgs_plugin.stream.scene import StreamError
 from freqgs_plugin.stream.write import StreamOptions, write_stream
 
 pytestmark = pytest.mark.browser

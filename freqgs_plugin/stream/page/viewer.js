@@ -170,7 +170,7 @@ class Viewer {
     const { bytes, chunks } = this.received, all = this.manifest.count;
     const part = chunks < this.manifest.chunks.length ? `, ${Math.floor((100 * bytes) / this.manifest.bytes)} % received` : "";
     $("count").textContent = `${this.drawn.toLocaleString("en")} of ${all.toLocaleString("en")} splats${part}`;
-    $("time").textContent = this.milliseconds ? `${this.milliseconds.toFixed(1)} ms` : "";
+    $("time").textContent = this.milliseconds ? `${this.milliseconds.toFixed(1)} ms per picture` : "";
   }
 
   // Ask the worker; resolves when its order is in place.
