@@ -95,7 +95,7 @@ def test_errors_say_what_to_do(arguments, message, tmp_path, monkeypatch, capsys
 
 
 def test_a_bench_fills_its_page(tmp_path, monkeypatch):
-    run, views = fake_run(3, 600), fake_views(2)
+    run, views = fake_run(3, 150), fake_views(2)
     run.gaussians.features_rest.zero_()
     run.scene_distance, run.config = None, SimpleNamespace(experiment_name="small")
     monkeypatch.setattr(stream_measure, "load", lambda path: run)
@@ -108,7 +108,7 @@ def test_a_bench_fills_its_page(tmp_path, monkeypatch):
     rows = tables["stream-curve"]["rows"]
     # harmonics that are nothing are not sent
     assert [row["what"] for row in rows] == ["first chunk", "level 1", "level 2", "level 3"]
-    assert [row["gaussians"] for row in rows][1:] == [200, 400, 600]
+    assert [row["gaussians"] for row in rows][1:] == [50, 100, 150]
     (variant,), (line,) = tables["stream-variants"]["rows"], tables["stream-lines"]["rows"]
     assert rows[-1]["bytes"] == variant["bytes"] and variant["own"] > 35
     assert 0 < line["stream"]["first"] <= line["stream"]["base"] <= line["stream"]["full"]

@@ -18,6 +18,7 @@ class Viewer {
   }
 
   async start() {
+    if (!("DecompressionStream" in window)) throw new Error("This browser is too old: it cannot inflate streams.");
     const inside = $("manifest");
     if (!inside && BASE.origin !== location.origin) throw new Error("Streams are loaded from the page's own server alone.");
     const { found, data, bytes } = inside ? Loader.embedded() : await Loader.manifest(folder());
