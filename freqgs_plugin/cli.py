@@ -223,7 +223,7 @@ def _expected(error: Exception) -> bool:
     from freqgs_plugin.reports.bench.options import BenchError
     from freqgs_plugin.reports.experiments.options import ExperimentError
     from freqgs_plugin.reports.stability.runner import StabilityError
-    from freqgs_plugin.stream.scene import StreamError
+    from freqgs_plugin.stream.errors import StreamError
 
     ours = (
         CommandError,

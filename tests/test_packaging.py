@@ -226,6 +226,8 @@ def test_a_wheel_works_by_itself(tmp_path):
     install = ["install", "--no-deps", "--no-index", "--target", str(site), str(wheel)]
     subprocess.run([*pip, *install], check=True, timeout=240, capture_output=True)
     written = {p.relative_to(source) for p in source.glob("[fm]*/**/*.py")}
+    page = {p.relative_to(source) for p in source.glob("freqgs_plugin/stream/page/*")}
+    assert page and all((site / path).is_file() for path in page)
     assert written and written <= {p.relative_to(site) for p in site.rglob("*.py")}
     code = (
         "from importlib.metadata import distribution\n"

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.quantise import Coding, decode_column, encode_column
-from freqgs_plugin.stream.scene import StreamError
 
 Columns = Mapping[str, Float[np.ndarray, "n c"]]
 """name -> numbers of some rows"""

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import IO
 
 from freqgs_plugin.stream.chunks import checksum
+from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.manifest import MANIFEST, Chunk, Manifest, parse_manifest
 from freqgs_plugin.stream.received import Received
-from freqgs_plugin.stream.scene import StreamError
 
 _BROKEN = (OSError, http.client.HTTPException)
 Arrived = Callable[[Chunk, int], object]

@@ -4,7 +4,8 @@ import base64
 import re
 from pathlib import Path
 
-from freqgs_plugin.stream.scene import StreamError, StreamScene
+from freqgs_plugin.stream.errors import StreamError
+from freqgs_plugin.stream.scene import StreamScene
 from freqgs_plugin.stream.server import PAGE
 from freqgs_plugin.stream.write import Stream, StreamOptions, encode_stream, replace_file
 

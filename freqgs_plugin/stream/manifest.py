@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.quantise import NAMES, Coding
-from freqgs_plugin.stream.scene import StreamError
 
 FORMAT, VERSION = "freqgs-stream", 1
 MANIFEST = "manifest.json"

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from freqgs_plugin.stream.chunks import checksum, decode_chunk
+from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.manifest import Chunk, Manifest
-from freqgs_plugin.stream.scene import StreamError
 from freqgs_plugin.types import Gaussians
 
 _WIDTHS = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "features_dc": 3}

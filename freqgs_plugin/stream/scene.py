@@ -9,10 +9,6 @@ from torch import Tensor
 from freqgs_plugin.types import Camera, Gaussians
 
 
-class StreamError(RuntimeError):
-    """A stream that cannot be written, read or fetched as asked; the message holds the remedy."""
-
-
 @dataclass(frozen=True)
 class StreamScene:
     """Gaussians, how they are drawn, and from where they were seen."""

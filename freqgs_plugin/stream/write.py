@@ -12,10 +12,11 @@ import torch
 from freqgs_plugin.functional.attenuation import DistanceDecay
 from freqgs_plugin.rendering.base import get_rasterizer
 from freqgs_plugin.stream.chunks import Columns, checksum, encode_chunk
+from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.manifest import DATA, MANIFEST, Chunk, Level, Manifest
 from freqgs_plugin.stream.order import importance, size, streaming_order
 from freqgs_plugin.stream.quantise import NAMES, VARIANTS, Coding, coding_of
-from freqgs_plugin.stream.scene import StreamError, StreamScene
+from freqgs_plugin.stream.scene import StreamScene
 from freqgs_plugin.types import Camera, Gaussians
 
 PARTS = ("core", "sh")

@@ -9,8 +9,8 @@ import torch
 from scenes_to_stream import Recording, breaking, damaging, deaf, served, small_scene
 
 from freqgs_plugin.stream.client import Patience, fetch
+from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.manifest import MANIFEST
-from freqgs_plugin.stream.scene import StreamError
 from freqgs_plugin.stream.server import Throttle, byte_range
 from freqgs_plugin.stream.write import StreamOptions, write_stream
 

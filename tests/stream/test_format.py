@@ -14,11 +14,11 @@ from scenes_to_stream import small_scene
 from freqgs_plugin.functional.attenuation import LevelCut
 from freqgs_plugin.rendering.base import get_rasterizer
 from freqgs_plugin.rendering.render import render
+from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.manifest import MANIFEST, parse_manifest
 from freqgs_plugin.stream.order import importance, streaming_order
 from freqgs_plugin.stream.quantise import VARIANTS, coding_of, decode_column, encode_column
 from freqgs_plugin.stream.received import Received
-from freqgs_plugin.stream.scene import StreamError
 from freqgs_plugin.stream.write import StreamOptions, encode_stream, write_stream
 
 FINE = VARIANTS["fine"]

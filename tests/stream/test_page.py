@@ -10,9 +10,9 @@ from scene_page import ScenePage, agreement, ours
 from scenes_to_stream import breaking, damaging, deaf, served, small_scene, stalling
 
 from freqgs_plugin.stream.client import fetch
+from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.html import write_html
 from freqgs_plugin.stream.manifest import MANIFEST
-from freqgs_plugin.stream.scene import StreamError
 from freqgs_plugin.stream.write import StreamOptions, write_stream
 
 pytestmark = pytest.mark.browser
@@ -159,11 +159,15 @@ def test_what_stays_damaged_is_reported_and_the_rest_shown(visit, stream):
     assert whole(page, stream)
 
 
-def test_no_stream_is_said_so(visit, tmp_path):
-    (tmp_path / MANIFEST).write_text('{"format": "else", "version": 3}')
+@pytest.mark.parametrize(
+    ("text", "said"), [('{"format": "else", "version": 3}', "else of version 3"), ("{", "is damaged"), (None, "404")]
+)
+def test_no_stream_is_said_so(visit, tmp_path, text, said):
+    if text is not None:
+        (tmp_path / MANIFEST).write_text(text)
     page = visit(folder=tmp_path)
     page.until("freqgs.problem")
-    assert "else of version 3" in page.text() and "Nothing can be shown" in page.text()
+    assert said in page.text() and "Nothing can be shown" in page.text()
 
 
 def test_one_file_needs_no_server(chromium, stream, tmp_path):

@@ -235,8 +235,8 @@ def figure(curves: Mapping[str, list[Point]], plys: Mapping[str, int], variants:
             )
         for row in (row for row in variants if row["scene"] == name):
             each.plot(row["bytes"] / 1e6, row["photographs"], "o", color=GREY, markerfacecolor="white", zorder=1)
-            each.annotate(row["variant"], (row["bytes"] / 1e6, row["photographs"]), (0, -12), fontsize=7,
-                          textcoords="offset points", ha="center")  # fmt: skip
+            place, turn = (row["bytes"] / 1e6, row["photographs"]), {"rotation": -50, "rotation_mode": "anchor"}
+            each.annotate(row["variant"], place, (4, -8), fontsize=7, textcoords="offset points", va="top", **turn)
             best = row["photographs"] + row["loss"]
         each.plot(plys[name] / 1e6, best, "x", color="black", label="PLY")
         each.set(title=name, xlabel="MB received", ylabel="PSNR, photographs, dB", xscale="log")

@@ -21,7 +21,8 @@ const Loader = (() => {
         const text = await response.text();
         return { found: check(JSON.parse(text)), bytes: text.length };
       } catch (error) {
-        if (attempt >= BREAKS || error instanceof Refused || error instanceof SyntaxError) throw error;
+        if (error instanceof SyntaxError) throw new Refused("manifest.json is damaged; write the stream anew.");
+        if (attempt >= BREAKS || error instanceof Refused) throw error;
         await wait(PAUSE * 2 ** attempt);
       }
     }

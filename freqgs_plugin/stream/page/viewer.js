@@ -18,6 +18,7 @@ class Viewer {
   }
 
   async start() {
+    if (!("DecompressionStream" in window)) throw new Error("This browser is too old: it cannot inflate streams.");
     const inside = $("manifest");
     if (!inside && BASE.origin !== location.origin) throw new Error("Streams are loaded from the page's own server alone.");
     const { found, data, bytes } = inside ? Loader.embedded() : await Loader.manifest(folder());
@@ -170,7 +171,7 @@ class Viewer {
     const { bytes, chunks } = this.received, all = this.manifest.count;
     const part = chunks < this.manifest.chunks.length ? `, ${Math.floor((100 * bytes) / this.manifest.bytes)} % received` : "";
     $("count").textContent = `${this.drawn.toLocaleString("en")} of ${all.toLocaleString("en")} splats${part}`;
-    $("time").textContent = this.milliseconds ? `${this.milliseconds.toFixed(1)} ms` : "";
+    $("time").textContent = this.milliseconds ? `${this.milliseconds.toFixed(1)} ms per picture` : "";
   }
 
   // Ask the worker; resolves when its order is in place.

@@ -1,0 +1,123 @@
+"""`freqgs stream`, `freqgs serve` and `freqgs bench stream`, as a user calls them."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+from fake_run import fake_run, fake_views
+from scenes_to_stream import small_scene
+
+from freqgs_plugin.cli import main
+from freqgs_plugin.io.parameters import RawGaussians
+from freqgs_plugin.io.ply import write_ply
+from freqgs_plugin.reports.bench import stream_measure
+from freqgs_plugin.reports.bench.stream_measure import worst_dip
+from freqgs_plugin.stream.client import fetch
+from freqgs_plugin.stream.manifest import MANIFEST
+
+
+@pytest.fixture
+def ply(tmp_path):
+    g = small_scene(120).gaussians
+    raw = RawGaussians(
+        means=g.means,
+        scales=g.scales.log(),
+        quats=g.quats,
+        features_dc=g.features_dc,
+        features_rest=g.features_rest,
+        opacities=g.opacities.logit()[:, None],
+    )
+    write_ply(tmp_path / "scene.ply", raw)
+    return tmp_path / "scene.ply", g
+
+
+def test_a_ply_is_streamed_and_served(ply, tmp_path, capsys):
+    path, gaussians = ply
+    main(["stream", "--ply", str(path), "--output-dir", str(tmp_path / "out"), "--variant", "exact"])
+    assert "120 Gaussians" in capsys.readouterr().out
+    program = [
+        sys.executable,
+        "-c",
+        "from freqgs_plugin.cli import main; main()",
+        "serve",
+        str(tmp_path),
+        "--port",
+        "0",
+    ]
+    child = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout is not None
+        found = re.fullmatch(r"(http://127\.0\.0\.1:\d+)/\?stream=out/\n", child.stdout.readline())
+        assert found, child.stderr
+        fetched = fetch(f"{found[1]}/out")
+        child.send_signal(signal.SIGINT)
+        said, errors = child.communicate(timeout=20)
+    finally:
+        child.kill()
+    assert child.returncode == 0 and "Stopped" in said and not errors
+    received = fetched.received.gaussians()
+    assert not received.signed_residuals and len(received) == 120
+    assert torch.equal(received.means.sort(0).values, gaussians.means.sort(0).values)
+
+
+def test_one_file(ply, tmp_path):
+    main(["stream", "--ply", str(ply[0]), "--html", str(tmp_path / "deep" / "scene.html")])
+    text = (tmp_path / "deep" / "scene.html").read_text()
+    assert "freqgs-stream" in text and 'src="' not in text and 'href="style' not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["stream"], "nothing to draw"),
+        (["stream", "--ply", "missing.ply"], "missing.ply is no file"),
+        (["serve", "missing"], "missing is no folder"),
+        (["serve", "."], "holds no manifest.json"),
+        (["serve", ".", "--mbits", "0"], "mbits is 0"),
+        (["serve", "damaged"], "no manifest of a stream"),
+        (["bench", "stream", "--load-config", "a", "--names", "x", "y"], "2 names for 1 runs"),
+    ],
+)
+def test_errors_say_what_to_do(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / MANIFEST).write_text("nonsense")
+    if arguments == ["serve", "."]:
+        (tmp_path / "damaged" / MANIFEST).unlink()
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_bench_fills_its_page(tmp_path, monkeypatch):
+    run, views = fake_run(3, 150), fake_views(2)
+    run.gaussians.features_rest.zero_()
+    run.scene_distance, run.config = None, SimpleNamespace(experiment_name="small")
+    monkeypatch.setattr(stream_measure, "load", lambda path: run)
+    monkeypatch.setattr(stream_measure, "views_of", lambda run: views)
+    monkeypatch.setattr(stream_measure, "views_of_split", lambda run, split: views)
+    page = tmp_path / "page.md"
+    page.write_text("".join(f"<!-- {n} -->\n<!-- end of {n} -->\n" for n in TABLES))
+    main(["bench", "stream", "--load-config", "run", "--quick", "--docs", str(page), "--output-dir", str(tmp_path)])
+    tables = json.loads((tmp_path / "stream.json").read_text())["tables"]
+    rows = tables["stream-curve"]["rows"]
+    # harmonics that are nothing are not sent
+    assert [row["what"] for row in rows] == ["first chunk", "level 1", "level 2", "level 3"]
+    assert [row["gaussians"] for row in rows][1:] == [50, 100, 150]
+    (variant,), (line,) = tables["stream-variants"]["rows"], tables["stream-lines"]["rows"]
+    assert rows[-1]["bytes"] == variant["bytes"] and variant["own"] > 35
+    assert 0 < line["stream"]["first"] <= line["stream"]["base"] <= line["stream"]["full"]
+    assert "small" in page.read_text() and (tmp_path / "images" / "bench_stream.png").is_file()
+
+
+TABLES = ("stream-curve", "stream-variants", "stream-lines")
+
+
+def test_the_worst_dip():
+    assert worst_dip([1.0, 3.0, 2.5, 4.0, 3.9]) == 0.5
+    assert worst_dip([1.0, 1.0, 2.0]) == 0
