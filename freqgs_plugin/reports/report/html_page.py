@@ -107,7 +107,8 @@ def _drawn_figure(subset: Subset, point: Mapping[str, Any], number: int) -> str:
 def _figure(picture: UInt8[np.ndarray, "h w 3"], name: str, text: str) -> str:
     height, width = picture.shape[:2]
     return (
-        f'<figure style="max-width: {width}px"><img src="{_encoded(picture)}" width="{width}" height="{height}" alt="{_text(name)}">'
+        f'<figure style="max-width: {width}px">'
+        f'<img src="{_encoded(picture)}" width="{width}" height="{height}" alt="{_text(name)}">'
         f"<figcaption><b>{_text(name)}</b><br>{_text(text)}</figcaption></figure>"
     )
 
