@@ -13,7 +13,7 @@ from freqgs_plugin.stream.scene import StreamScene
 from freqgs_plugin.stream.server import Handler, Server
 
 
-def small_scene(n=900, levels=3, decay=False, width=96, height=72):
+def small_scene(n=600, levels=3, decay=False, width=80, height=60):
     """Larger Gaussians on coarser levels, harmonics of degree 1; seen from around."""
     run = fake_run(levels, n)
     shrink = 0.6 ** (run.gaussians.level - 1).float()

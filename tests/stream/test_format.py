@@ -37,21 +37,21 @@ def numbers(width, low, high):
     )
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(numbers(4, -(2.0**100), 2.0**100))
 def test_exact_is_bit_for_bit(values):
     found, _ = back("quats", values, None)
     assert np.array_equal(found.view(np.uint32), values.view(np.uint32))
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(numbers(6, -4, 4))
 def test_coefficients_are_within_half_a_step(values):
     found, _ = back("features_rest", values, FINE)
     assert np.abs(found - values).max() <= FINE.features_rest / 2 + 1e-6
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(numbers(3, 2.0**-66, 2.0**20))
 def test_scales_are_within_half_a_step_of_their_logarithm(values):
     found, coding = back("scales", values, FINE)
@@ -59,7 +59,7 @@ def test_scales_are_within_half_a_step_of_their_logarithm(values):
     assert max(coding.step) == FINE.scales
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(numbers(1, 0, 1))
 def test_opacities_are_within_half_a_step_of_their_logit(values):
     found, _ = back("opacities", values, FINE)
@@ -67,7 +67,7 @@ def test_opacities_are_within_half_a_step_of_their_logit(values):
     assert np.abs(found - np.clip(values, 1 / (1 + np.exp(6)), 1 / (1 + np.exp(-8)))).max() <= FINE.opacities / 8 + 1e-6
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(numbers(3, -1e4, 1e4))
 def test_positions_have_sixteen_bits_in_their_box(values):
     found, coding = back("means", values, FINE)
@@ -77,7 +77,7 @@ def test_positions_have_sixteen_bits_in_their_box(values):
     assert error <= 0.55 * max(coding.step) * farthest * 1.5 + 1e-6 * np.abs(values).max()
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(numbers(4, -3, 3).filter(lambda q: (np.abs(q).max(1) > 1e-3).all()))
 def test_rotations_are_the_same_rotations(quats):
     found, _ = back("quats", quats, FINE)

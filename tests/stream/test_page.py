@@ -148,11 +148,11 @@ def test_broken_lines_damage_and_deaf_servers(visit, stream):
 
 def test_what_stays_damaged_is_reported_and_the_rest_shown(visit, stream):
     _, manifest, gaussians = stream
-    assert manifest.chunks[1].part == "core"
-    handler = damaging(manifest.chunks[1].offset + 3, 3)
+    chunk = next(c for c in manifest.chunks if (c.level, c.part) == (2, "core"))
+    handler = damaging(chunk.offset + 3, 3)
     page = visit(handler).loaded()
     assert f"1 of {len(manifest.chunks)} parts arrived damaged" in page.text()
-    assert page.capture()[1] == len(gaussians) - manifest.chunks[1].count
+    assert page.capture()[1] == len(gaussians) - chunk.count
     # by now the file is right again
     page.page.locator("#again").click()
     page.until("freqgs.received.chunks === freqgs.manifest.chunks.length")
