@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from freqgs_plugin.commands.export_files import check_targets, put_in_place, staging, targets, write_manifest
-from freqgs_plugin.commands.export_formats import FORMATS, MANIFEST, Format, Work
+from freqgs_plugin.commands.export_formats import FORMATS, Format, Work
 from freqgs_plugin.commands.export_loss import Loss, Shown, Written
 from freqgs_plugin.commands.export_options import ExportOptions
 from freqgs_plugin.commands.export_source import Source, open_source
@@ -56,7 +56,7 @@ def _export(options: ExportOptions, console: "Console") -> list[Path]:
         written = chosen.write(source, options, work)
         record = {**_record(options, source, load), "seconds": round(time.perf_counter() - begun, 1)}
         manifest = _manifest(chosen, written, work, source, options, record)
-        beside = folder / f"{chosen.name}.json" if len(paths) > 1 else folder / chosen.name / MANIFEST
+        beside = folder / f"{chosen.name}.json" if len(paths) > 1 else folder / chosen.name / chosen.manifest
         write_manifest(beside, manifest)
         table = _table(written, folder / chosen.name, source, options, place)
         put_in_place([folder / path.name for path in paths], paths)

@@ -10,6 +10,7 @@ from freqgs_plugin.commands.export_loss import Loss, Written, measure_loss
 from freqgs_plugin.commands.export_options import ExportOptions
 from freqgs_plugin.commands.export_plain import Plain, check_plain, plain
 from freqgs_plugin.commands.export_source import Source, select
+from freqgs_plugin.commands.export_streams import FOLDER, PAGE, check_stream, write_as_html, write_as_stream
 from freqgs_plugin.functional.similarity import Similarity
 from freqgs_plugin.io.ply import SplatFileError, write_ply
 from freqgs_plugin.io.splat_transform import INSTALL, NAME, find_tool, run_tool, streamed_command, tool_version
@@ -44,6 +45,8 @@ class Format:
     """of the file or folder that is written; beside a file lies NAME.json, in a folder manifest.json"""
     check: Callable[[Source, ExportOptions], None] = check_plain
     """raises ValueError for what cannot be written, before work begins"""
+    manifest: str = MANIFEST
+    """of a folder, the file that tells what was lost"""
 
 
 def write_as_ply(source: Source, options: ExportOptions, work: Work) -> list[Written]:
@@ -125,6 +128,8 @@ FORMATS: dict[str, Format] = {
     "ply": Format(write_as_ply, PLY),
     "levels": Format(write_as_levels, LEVELS, check_levels),
     "spz": Format(write_as_spz, SPZ, check_spz),
+    "stream": Format(write_as_stream, FOLDER, check_stream, "export.json"),
+    "html": Format(write_as_html, PAGE, check_stream),
 }
 """name on the command line -> how it is written"""
 

@@ -117,13 +117,14 @@ def measure_loss(path: Path, source: Source, mip: bool, move: Similarity) -> Los
                 scene.splats(camera), camera, background=source.scene.background, antialiased=antialiased, depth=False
             )
             pictures.append(rendering.features.clamp(0, 1))
-        return Shown(_mean_psnr(pictures, source.pictures), _mean_psnr(pictures, photographs))
+        return Shown(mean_psnr(pictures, source.pictures), mean_psnr(pictures, photographs))
 
-    ours = _mean_psnr(source.pictures, photographs)
+    ours = mean_psnr(source.pictures, photographs)
     return Loss(len(cameras), ours, shown(True) if mip else None, shown(False))
 
 
-def _mean_psnr(pictures: Sequence[torch.Tensor], targets: Sequence[torch.Tensor]) -> float:
+def mean_psnr(pictures: Sequence[torch.Tensor], targets: Sequence[torch.Tensor]) -> float:
+    """Mean over pairs of pictures in [0, 1], dB."""
     return sum(psnr(a, b) for a, b in zip(pictures, targets, strict=True)) / len(pictures)
 
 

@@ -15,9 +15,12 @@ class ExportOptions:
     """config.yml of a trained run"""
     format: str = "ply"
     """ply: one file for any 3DGS viewer; levels: a PLY for each prefix and for each level; spz: Niantic's compressed
-    format, through splat-transform"""
+    format, through splat-transform; stream: a folder for `freqgs serve`, shown as it arrives; html: one file with the
+    page and the scene in it"""
     output_dir: Path = Path("exports")
-    """folder for the files: splat.ply, levels/, splat.spz, each with a JSON that says what was lost"""
+    """folder for splat.ply, levels/, splat.spz, stream/ or scene.html, each with a JSON that says what was lost"""
+    variant: Literal["exact", "fine", "balanced", "small"] = "balanced"
+    """stream and html: float32 bit for bit, or quantised; the documentation has bytes and errors"""
     overwrite: bool = False
     """replace what an earlier export wrote there"""
     level: int | None = None

@@ -31,10 +31,12 @@ def serve(
     if mbits is not None and not mbits > 0:
         raise CommandError(f"mbits is {mbits:g}; give a speed above 0, in Mbit/s.")
     if not directory.is_dir():
-        raise CommandError(f"{directory} is no folder; name one that `freqgs stream` wrote.")
+        raise CommandError(f"{directory} is no folder; name one that `freqgs export --format stream` wrote.")
     manifests = sorted({*directory.glob(MANIFEST), *directory.glob(f"*/{MANIFEST}")})
     if not manifests:
-        raise CommandError(f"{directory} holds no {MANIFEST}; name a folder that `freqgs stream` wrote.")
+        raise CommandError(
+            f"{directory} holds no {MANIFEST}; name a folder that `freqgs export --format stream` wrote."
+        )
     for path in manifests:
         parse_manifest(path.read_bytes(), str(path))
     try:

@@ -179,7 +179,9 @@ class _Line:
         if not self._remote:
             path = Path(self.source) / name
             if not path.is_file():
-                raise StreamError(f"{path} is no file; name the folder of a stream (`freqgs stream` writes one).")
+                raise StreamError(
+                    f"{path} is no file; name the folder of a stream (`freqgs export --format stream` writes one)."
+                )
             stream = path.open("rb")
             stream.seek(start)
             return stream, start

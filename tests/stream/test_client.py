@@ -110,7 +110,7 @@ def test_a_damaged_chunk_is_asked_for_again(stream, expected, times, stays):
 
 def test_errors_say_what_to_do(stream, tmp_path):
     manifest = stream[1]
-    with pytest.raises(StreamError, match="freqgs stream"):
+    with pytest.raises(StreamError, match="freqgs export --format stream"):
         fetch(tmp_path)
     with served(tmp_path) as server:
         with pytest.raises(StreamError, match=r"404 .*name the address"):

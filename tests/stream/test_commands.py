@@ -38,7 +38,7 @@ def ply(tmp_path):
 
 def test_a_ply_is_streamed_and_served(ply, tmp_path, capsys):
     path, gaussians = ply
-    main(["stream", "--ply", str(path), "--output-dir", str(tmp_path / "out"), "--variant", "exact"])
+    main(["stream", str(path), "--output-dir", str(tmp_path / "out"), "--variant", "exact"])
     assert "120 Gaussians" in capsys.readouterr().out
     program = [
         sys.executable,
@@ -66,7 +66,7 @@ def test_a_ply_is_streamed_and_served(ply, tmp_path, capsys):
 
 
 def test_one_file(ply, tmp_path):
-    main(["stream", "--ply", str(ply[0]), "--html", str(tmp_path / "deep" / "scene.html")])
+    main(["stream", str(ply[0]), "--html", str(tmp_path / "deep" / "scene.html")])
     text = (tmp_path / "deep" / "scene.html").read_text()
     assert "freqgs-stream" in text and 'src="' not in text and 'href="style' not in text
 
@@ -74,8 +74,7 @@ def test_one_file(ply, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["stream"], "nothing to draw"),
-        (["stream", "--ply", "missing.ply"], "missing.ply is no file"),
+        (["stream", "missing.ply"], "missing.ply is no file"),
         (["serve", "missing"], "missing is no folder"),
         (["serve", "."], "holds no manifest.json"),
         (["serve", ".", "--mbits", "0"], "mbits is 0"),

@@ -1,4 +1,7 @@
-"""`freqgs stream` of trained runs."""
+"""`freqgs export --format stream` and `html` of trained runs."""
+
+import json
+import re
 
 import pytest
 import torch
@@ -14,8 +17,9 @@ pytestmark = pytest.mark.slow
 def test_a_run_is_streamed(method, request, tmp_path):
     config = request.getfixturevalue(method)
     run = load_run(config)
-    main(["stream", "--load-config", str(config), "--output-dir", str(tmp_path), "--variant", "exact"])
-    received = fetch(tmp_path).received
+    arguments = ["export", "--load-config", str(config), "--format", "stream", "--output-dir", str(tmp_path)]
+    main([*arguments, "--variant", "exact"])
+    received = fetch(tmp_path / "stream").received
     manifest, found = received.manifest, received.gaussians()
     assert manifest.antialiased == run.antialiased and manifest.scene_distance == run.scene_distance
     assert [view["name"] for view in manifest.views] == [view.name for view in run.cameras("test")]
@@ -24,3 +28,20 @@ def test_a_run_is_streamed(method, request, tmp_path):
     assert torch.equal(torch.bincount(found.level.long()), torch.bincount(own.level.long()))
     for mine, theirs in ((found.means, own.means), (found.features_rest, own.features_rest)):
         assert torch.equal(mine.flatten().sort().values, theirs.detach().flatten().sort().values)
+    told = json.loads((tmp_path / "stream" / "export.json").read_text(encoding="utf-8"))["files"]["stream"]
+    assert told["gaussians"] == len(own) and told["loss"]["classic_viewers"]["same_pictures"]
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert fetch(tmp_path / "stream").received.count == len(own)
+
+
+def test_a_run_is_one_page(trained, tmp_path, capsys):
+    arguments = ["export", "--load-config", str(trained), "--format", "html", "--output-dir", str(tmp_path)]
+    with pytest.raises(SystemExit):
+        main([*arguments, "--bake"])
+    assert "--bake: the page draws the scene as it is trained" in re.sub(r"\s+", " ", capsys.readouterr().err)
+    main([*arguments, "--level", "1"])
+    page = (tmp_path / "scene.html").read_text(encoding="utf-8")
+    told = json.loads((tmp_path / "scene.html.json").read_text(encoding="utf-8"))["files"]["scene.html"]
+    assert 'src="' not in page and 20 < told["loss"]["classic_viewers"]["psnr_to_our_pictures"] < 120
+    assert told["gaussians"] == int((load_run(trained).gaussians.level == 1).sum())
