@@ -10,7 +10,8 @@ from freqgs_plugin import cli
 from freqgs_plugin.demo import experiments, training
 from freqgs_plugin.reports.experiments import ablation
 from freqgs_plugin.reports.experiments.options import ClodOptions, ExperimentError
-from freqgs_plugin.reports.experiments.training import PLAIN, ExperimentScene, Trial
+from freqgs_plugin.reports.experiments.training import ExperimentScene, Trial
+from freqgs_plugin.training.presets import CLODSPLAT_PAPER, LAPSPLAT_PAPER, PLAIN
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -27,10 +28,16 @@ def test_defaults_have_every_option_that_is_set():
     assert default.settings(clod) == trial.clod().settings(clod)
 
 
-def test_plain_is_what_the_documentation_calls_one_level():
-    section = (DOCS / "methods.md").read_text().split("### One level")[1].split("```")[1]
-    named = dict(re.findall(r"--pipeline\.model\.([\w-]+) ([\d.]+)", section))
-    assert {name.replace("-", "_"): float(value) for name, value in named.items()} == PLAIN
+@pytest.mark.parametrize(
+    ("method", "preset"),
+    [("lapsplat-plain", PLAIN), ("lapsplat-paper", LAPSPLAT_PAPER), ("clodsplat-paper", CLODSPLAT_PAPER)],
+)
+def test_a_preset_is_a_method_that_differs_in_it_alone(method, preset):
+    ours, base = experiments.method_defaults(method), experiments.method_defaults(method.split("-")[0])
+    differs = {name for name in base if ours[name] != base[name]} - {"optimizers"}
+    assert {name: ours[name] for name in preset} == {name: repr(value) for name, value in preset.items()}
+    assert differs <= set(preset) and len(differs) > 2
+    assert method in (DOCS / "methods.md").read_text(encoding="utf-8")
 
 
 def test_arguments_name_method_options_and_seed(tmp_path, monkeypatch):

@@ -49,7 +49,14 @@ def test_a_ply_is_streamed_and_served(ply, tmp_path, capsys):
         "--port",
         "0",
     ]
-    child = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    child = subprocess.Popen(
+        program,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # a shell that runs this in the background has its children ignore Ctrl-C
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     try:
         assert child.stdout is not None
         found = re.fullmatch(r"(http://127\.0\.0\.1:\d+)/\?stream=out/\n", child.stdout.readline())
