@@ -1,7 +1,6 @@
 """What `freqgs experiment` hands to its experiments: scenes, ns-train's arguments, defaults of the methods."""
 
 import json
-import re
 from pathlib import Path
 
 import pytest
