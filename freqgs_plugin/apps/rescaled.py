@@ -21,6 +21,8 @@ from freqgs_plugin.types import Camera, Gaussians, Rendering
 
 SEAM = 0.05
 """width of the ring in which the two pictures are blended, share of the longer side"""
+MOST = 32
+"""times smaller; beyond, nothing is left to enlarge"""
 TIMES = (4, 2, 1)
 """choices of `suitable`"""
 LEAST = 960
@@ -69,10 +71,9 @@ def render_rescaled(
     and with `times` 1, it is the picture of `render`. No gradients.
 
     Raises:
-        ValueError: `times` is below 1.
+        ValueError: `times` is not in 1..32.
     """
-    if times < 1:
-        raise ValueError(f"times is {times}; it must be a whole number from 1: so many times smaller is the picture.")
+    check_times(times)
     look: dict[str, Any] = {
         "rasterizer": rasterizer, "background": background, "antialiased": antialiased, "depth": depth
     }  # fmt: skip
@@ -103,6 +104,12 @@ def render_rescaled(
             part[place] = torch.lerp(part[place], full, share)
     info = {**outside.info, "width": camera.width, "height": camera.height}
     return Rendering(parts[0], parts[1], parts[2], info)
+
+
+def check_times(times: int) -> None:
+    """Refuse what no picture can be made smaller by, with a ValueError."""
+    if not 1 <= times <= MOST:
+        raise ValueError(f"{times} times smaller: it must be a whole number from 1 to {MOST}.")
 
 
 def smaller(camera: Camera, times: int) -> Camera:

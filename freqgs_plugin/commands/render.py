@@ -12,7 +12,7 @@ from freqgs_plugin.apps.amount import Amount, parse_amount
 from freqgs_plugin.apps.foveation import Foveation
 from freqgs_plugin.apps.gaze import Point, gaze_points, salient_point
 from freqgs_plugin.apps.own_filters import filter_file, find_filter
-from freqgs_plugin.apps.rescaled import render_rescaled, suitable
+from freqgs_plugin.apps.rescaled import check_times, render_rescaled, suitable
 from freqgs_plugin.apps.segmenters import SegmenterError
 from freqgs_plugin.commands.focusing import focus_on
 from freqgs_plugin.commands.frames import FrameFolder, FrameRecord, write_video
@@ -70,10 +70,14 @@ def _check(options: RenderOptions) -> Amount | None:
         raise ValueError(f"fps is {options.fps:g}; give frames per second above 0, up to 1000.")
     if options.gaze is not None:
         Foveation((0.5, 0.5), options.gaze_sigma, options.gaze_radius)
-        if options.gaze_scale is not None and options.gaze_scale < 1:
-            raise ValueError(f"gaze-scale is {options.gaze_scale}; it must be a whole number from 1.")
+        if options.gaze_scale is not None:
+            check_times(options.gaze_scale)
         if not Path(options.gaze).is_file():
             gaze_points(options.gaze, 1)
+    elif options.gaze_scale is not None:
+        raise ValueError(
+            "--gaze-scale says how small the picture is away from a gaze; give --gaze, too, or leave it out."
+        )
     if options.filter != "none":
         find_filter(options.filter)
     return None if options.budget is None else parse_amount(options.budget)

@@ -116,7 +116,7 @@ def coding_of(name: str, values: Float[np.ndarray, "n c"], steps: Steps | None) 
         low = np.floor(low / step) * step
     low, step = low.astype(np.float64), step.astype(np.float64)
     grid = _grid(numbers, low, step)
-    size = 1 if len(grid) == 0 or grid.max() < 256 else 2
+    size = 1 if grid.size == 0 or grid.max() < 256 else 2
     kept = _kept(grid != grid[:1])
     if len(grid):
         low = np.where(np.isin(np.arange(len(low)), kept), low, low + grid[0] * step)

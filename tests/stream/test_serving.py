@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +15,7 @@ from scenes_to_stream import small_scene
 
 from freqgs_plugin.cli import main
 from freqgs_plugin.io.parameters import RawGaussians
-from freqgs_plugin.io.ply import write_ply
+from freqgs_plugin.io.ply import read_ply, write_ply
 from freqgs_plugin.reports.bench import stream_measure
 from freqgs_plugin.reports.bench.stream_measure import worst_dip
 from freqgs_plugin.stream.client import fetch
@@ -70,6 +71,20 @@ def test_a_ply_is_streamed_and_served(ply, tmp_path, capsys):
     received = fetched.received.gaussians()
     assert not received.signed_residuals and len(received) == 120
     assert torch.equal(received.means.sort(0).values, gaussians.means.sort(0).values)
+
+
+@pytest.mark.parametrize("variant", ["exact", "balanced"])
+def test_a_scene_without_harmonics_is_streamed(ply, tmp_path, variant):
+    """Many tools leave f_rest out of a PLY whose colours do not change with the direction."""
+    path, gaussians = ply
+    raw = replace(read_ply(path)[0], features_rest=torch.zeros(len(gaussians), 0, 3))
+    write_ply(tmp_path / "plain.ply", raw)
+    assert b"f_rest" not in (tmp_path / "plain.ply").read_bytes()[:1500]
+    main(["stream", str(tmp_path / "plain.ply"), "--output-dir", str(tmp_path / "out"), "--variant", variant])
+    received = fetch(tmp_path / "out").received.gaussians()
+    assert len(received) == 120 and received.features_rest.shape == (120, 0, 3)
+    main(["stream", str(tmp_path / "plain.ply"), "--html", str(tmp_path / "plain.html"), "--variant", variant])
+    assert (tmp_path / "plain.html").stat().st_size > 1000
 
 
 def test_one_file(ply, tmp_path):

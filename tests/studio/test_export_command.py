@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import stat
 
@@ -346,3 +347,12 @@ class TestBadInput:
         page.write_text("<!-- export lapsplat small ply -->\n<!-- end of export lapsplat small ply -->\n")
         freqgs("export", *more)
         assert "| splat.ply |" in page.read_text() and str(tmp_path) not in page.read_text()
+
+
+def test_a_truncated_checkpoint_is_named(trained, tmp_path, refused):
+    config = shutil.copytree(trained.parent, tmp_path / "small" / "lapsplat" / "cut") / "config.yml"
+    (checkpoint,) = sorted((config.parent / "nerfstudio_models").glob("*.ckpt"))[-1:]
+    checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
+    for command in ("export", "render"):
+        said = re.sub(r"\s+", " ", refused(command, "--load-config", config, "--output-dir", tmp_path / "out"))
+        assert "cannot be loaded" in said and "damaged" in said and not (tmp_path / "out").exists()

@@ -1,6 +1,7 @@
 """A trained run for a benchmark."""
 
 import io
+import pickle
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -8,17 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 
 from freqgs_plugin.rendering.render import shade
 from freqgs_plugin.reports.bench.options import BenchError
 from freqgs_plugin.reports.bench.workloads import Workload, image_gradient
+
+_UNREADABLE = (
+    *(OSError, EOFError, RuntimeError, pickle.UnpicklingError, yaml.YAMLError),
+    *(KeyError, TypeError, AttributeError, ImportError),
+)
+"""what damaged files and those of other versions raise: torch has no one error for them"""
 
 
 def load(config_path: Path) -> Any:
     """`studio.checkpoint.load_run` without nerfstudio's remarks. nerfstudio asserts that the data is there.
 
     Raises:
-        BenchError: there is no such run, or it is of another method.
+        BenchError: there is no such run, it is of another method, or its files are damaged.
     """
     try:
         with quiet():
@@ -29,6 +37,15 @@ def load(config_path: Path) -> Any:
         raise BenchError(str(error)) from error
     except SystemExit as error:
         raise BenchError(f"nerfstudio could not load {config_path}; `ns-eval --load-config` tells why") from error
+    except torch.OutOfMemoryError:
+        raise
+    except _UNREADABLE as error:
+        reason = " ".join(str(error).split())[:300]
+        raise BenchError(
+            f"the run {config_path} cannot be loaded: config.yml or the checkpoint in nerfstudio_models is damaged, or "
+            f"another version wrote it ({type(error).__name__}: {reason}). Copy the run again, or load it with the "
+            "version that trained it; where a checkpoint was cut off, remove it, and the one before it is used."
+        ) from error
 
 
 def views_of(run: Any) -> list[Any]:

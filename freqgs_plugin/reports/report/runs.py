@@ -1,7 +1,6 @@
 """The runs of a report: loaded, named, and known to show the same held-out views."""
 
 import hashlib
-import pickle
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import yaml
 
 from freqgs_plugin.functional.cost import bytes_per_gaussian
 from freqgs_plugin.reports.bench.options import BenchError
@@ -20,12 +18,6 @@ from freqgs_plugin.reports.report.options import ReportError
 
 Kind = Literal["prefixes", "scales", "shares"]
 """what is measured of a run: prefixes of its levels, a sweep of s_v, or cuts of a model of one level"""
-
-_UNREADABLE = (
-    *(OSError, EOFError, RuntimeError, pickle.UnpicklingError, yaml.YAMLError),
-    *(KeyError, TypeError, AttributeError, ImportError),
-)
-"""what damaged files and those of other versions raise: torch has no one error for them"""
 
 
 @dataclass(frozen=True)
@@ -113,15 +105,6 @@ def _open(path: Path) -> Any:
     except BenchError as error:
         known = str(path) in str(error) or str(path.parent) in str(error)
         raise ReportError(str(error) if known else f"the run {path} cannot be loaded: {error}") from error
-    except (ReportError, torch.OutOfMemoryError):
-        raise
-    except _UNREADABLE as error:
-        reason = " ".join(str(error).split())[:300]
-        raise ReportError(
-            f"the run {path} cannot be loaded: config.yml or the checkpoint in nerfstudio_models is damaged, or "
-            f"another version wrote it ({type(error).__name__}: {reason}). Copy the run again, or load it with the "
-            "version that trained it; where a checkpoint was cut off, remove it, and the one before it is used."
-        ) from error
 
 
 def _held_out(run: Any, path: Path) -> list[HeldOutView]:
