@@ -76,6 +76,14 @@ def test_settings_that_equal_the_defaults_make_the_same_training(tmp_path):
     assert len(tools.trained) == 7
 
 
+def test_an_option_that_came_later_trains_anew_only_where_it_acts(tmp_path):
+    _, tools = fake_lab(tmp_path)
+    defaults, training = dict(tools.defaults("lapsplat")), TRIAL.plain()
+    before = training.settings(defaults)
+    assert training.settings({**defaults, "least_level_gain": "0.0"}) == before
+    assert training.settings({**defaults, "least_level_gain": "0.5"}) != before
+
+
 def test_a_default_that_changed_trains_anew(tmp_path):
     lab, _ = fake_lab(tmp_path)
     lab.config_path(TRIAL.clod())

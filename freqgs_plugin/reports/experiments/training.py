@@ -12,6 +12,8 @@ from freqgs_plugin.types import Camera
 
 DEFAULT_SCALE = 5.0
 """s_max of all runs but those of the sections curve and sigma (the paper's ablations: 5)"""
+_LATER = {"auto_psnr": "30.0", "auto_share": "0.1", "least_level_gain": "0.0"}
+"""options that a model has got since runs were kept, with the values at which they change nothing"""
 _DOWNSCALED = re.compile(r"images_\d+$")
 
 
@@ -52,6 +54,8 @@ class Training:
         unknown = set(self.options) - set(defaults)
         assert not unknown, f"{self.method} has no options {sorted(unknown)}"
         model = {**defaults, **{name: repr(value) for name, value in self.options.items()}, "seed": repr(self.seed)}
+        # so that what was trained before they were there is found again
+        model = {name: value for name, value in model.items() if _LATER.get(name) != value}
         return {"scene": self.scene.identity, "method": self.method, "steps": self.steps, "model": model}
 
 
