@@ -99,7 +99,7 @@ def _with_speeds(*names: str) -> Callable[[Lab, Trial, TrialOptions], dict[str, 
 
 def _foveation(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
     training = training_of(trial, "lapsplat")
-    return lab.step("claims-foveation", [training], {}, lambda: foveated(lab.run(training)))
+    return lab.step("claims-foveation", [training], {"ways": ["plain", "smaller"]}, lambda: foveated(lab.run(training)))
 
 
 def _gain(results: Results, name: str, other: str) -> str:
