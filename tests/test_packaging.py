@@ -172,7 +172,7 @@ def test_the_readmes_setup_is_what_the_checks_run():
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     (install, run), others = commands()[6:8], [c for c in commands() if not c.startswith(("ns-", "freqgs"))]
     assert install == "pip install -e '.[test,docs]'" and install.removeprefix("pip install ") in script
-    assert run == "pytest" and f"\n{run}\n" in script
+    assert run == "pytest -n 2 --dist loadfile" and f"\n{run}\n" in script
     assert len(others) == 7
     assert os.access(ROOT / ".ci" / "run", os.X_OK)
 
