@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from freqgs_plugin.reports.experiments.lab import Tools
     from freqgs_plugin.reports.experiments.training import ExperimentScene, Training
 
+EVALUATIONS = 12
+"""of the held-out views, in the course of each training"""
 ClodFlags = Annotated[ClodOptions, tyro.conf.arg(name="")]
 ClaimsFlags = Annotated[ClaimsOptions, tyro.conf.arg(name="")]
 
@@ -40,7 +42,7 @@ def clod(options: ClodFlags = ClodOptions()) -> None:  # noqa: B008
 def claims(options: ClaimsFlags = ClaimsOptions()) -> None:  # noqa: B008
     """Put each claim of the two papers to the test, beside a plain model: holds or not, with its figures.
 
-    Trains 20 runs for each scene and seed, one at a time: hours on a CPU. Whatever is finished is kept, and the same
+    Trains 14 runs for each scene and seed, one at a time: hours on a CPU. Whatever is finished is kept, and the same
     command goes on from there.
     """
     from freqgs_plugin.reports.experiments.claims_runner import run_claims
@@ -138,6 +140,8 @@ def train_run(runs: Path, training: "Training", name: str, on_step: Callable[[in
         method=training.method,
         experiment=training.scene.name,
         options=training.arguments(),
+        # so that `freqgs report` has error against training time
+        evaluations=EVALUATIONS,
         parser=parser_of(training.scene.folder),
     )
     shutil.rmtree(run.folder, ignore_errors=True)

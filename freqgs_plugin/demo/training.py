@@ -35,6 +35,8 @@ class TrainingRun:
     experiment: str = "demo"
     options: tuple[str, ...] = ()
     """further arguments of the method"""
+    evaluations: int = 0
+    """how often all held-out views are evaluated during training, into the tensorboard log"""
     parser: tuple[str, ...] = ("colmap", "--colmap-path", "sparse/0", "--eval-mode", "interval", "--eval-interval", "8")
     """how the scene is read"""
 
@@ -48,8 +50,9 @@ class TrainingRun:
         return self.folder / "config.yml"
 
     def arguments(self, *more: str) -> list[str]:
-        """What follows `ns-train`. Evaluation during training is off: the report measures at the end."""
+        """What follows `ns-train`."""
         levels = () if self.levels is None else ("--pipeline.model.num-levels", str(self.levels))
+        every = max(self.steps // self.evaluations, 1) if self.evaluations else 0
         return [
             self.method,
             *("--data", str(self.scene)),
@@ -59,7 +62,7 @@ class TrainingRun:
             *("--max-num-iterations", str(self.steps)),
             *("--steps-per-save", str(max(self.steps // 4, 1))),
             *("--steps-per-eval-image", "0"),
-            *("--steps-per-eval-all-images", "0"),
+            *("--steps-per-eval-all-images", str(every)),
             *("--machine.seed", str(self.seed)),
             *levels,
             *self.options,

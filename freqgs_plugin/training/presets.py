@@ -6,6 +6,8 @@ Each is registered as a method of its own (`method_configs`). Step constants are
 from collections.abc import Mapping
 from typing import Any
 
+from freqgs_plugin.training.schedule import REFERENCE_STEPS
+
 Value = bool | int | float | str
 
 PLAIN: Mapping[str, Any] = {
@@ -19,6 +21,12 @@ PLAIN: Mapping[str, Any] = {
     "least_views": 0,
 }
 """settings of lapsplat that make it splatfacto's algorithm: one level, no decay"""
+
+
+def plain_at(halvings: int) -> Mapping[str, Any]:
+    """The same, trained at `halvings` times halved size and no other: its second level never begins."""
+    return {**PLAIN, "num_levels": halvings + 1, "level_interval": 100 * REFERENCE_STEPS, "coarse_growth_factor": 1.0}
+
 
 LAPSPLAT_PAPER: Mapping[str, Any] = {
     "growth": "all",

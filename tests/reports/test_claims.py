@@ -5,13 +5,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from rich.console import Console
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from fake_lab import SCENE, FakeTools, levels_run
 
-from freqgs_plugin.reports.experiments import claims, claims_measures
+from freqgs_plugin.reports.experiments import claims, claims_goals, claims_measures
 from freqgs_plugin.reports.experiments.claims import CLAIMS, RUNS, training_of
 from freqgs_plugin.reports.experiments.claims_runner import run_claims
 from freqgs_plugin.reports.experiments.options import ClaimsOptions, ExperimentError
@@ -83,7 +84,9 @@ def test_all_claims_are_measured_once_and_shown(tmp_path, monkeypatch):
     with pytest.raises(ExperimentError, match="nothing finished"):
         run_claims(ClaimsOptions(**{**vars(options), "page_only": True}), [SCENE], tools.tools(), console)
     found = run_claims(options, [SCENE], tools.tools(), console)
-    assert {name for name in found if found[name]} == {*BY_NAME, "runs"}
+    assert {name for name in found if found[name]} == {*BY_NAME, "goals", "runs"}
+    # 8 of the table of runs, 2 of one size, s_max 1, plain's coarse sibling, without w_s, without L_reg
+    assert len(tools.trained) == 8 + 2 + 4
     assert len(tools.trained) == len({str(training) for training in tools.trained})
     page = docs.read_text(encoding="utf-8")
     assert page == (tmp_path / "out" / "claims.md").read_text(encoding="utf-8")
@@ -91,6 +94,7 @@ def test_all_claims_are_measured_once_and_shown(tmp_path, monkeypatch):
         (row,) = (line for line in page.splitlines() if line.startswith(f"| {claim.name} "))
         assert row.endswith(("| holds |", "| does not hold |")) and claim.paper in row
     assert all(f"| {name} |" in page for name in RUNS)
+    assert "## Goals" in page and "| prefix 2: at most 1 dB under a plain model of its size |" in page
     again = FakeTools(tmp_path / "runs")
     run_claims(options, [SCENE], again.tools(), console)
     assert again.trained == []
@@ -99,3 +103,43 @@ def test_all_claims_are_measured_once_and_shown(tmp_path, monkeypatch):
 def test_the_papers_settings_are_those_of_the_registered_method():
     assert claims.VARIANTS["paper"] == ("lapsplat-paper", {})
     assert training_of(Trial(SCENE, 30, 42), "clodsplat-paper").method == "clodsplat-paper"
+
+
+def goals_with(gain=0.6, count=50, base=0.1, seconds=(1.0, 2.0), above=(-0.9, -0.9)):
+    plain, ours = run_of(gaussians=100), run_of(psnr=25 + gain, gaussians=count, prefixes=[30.0, 28.0, 25.0])
+    ours["counts"] = [base * count, 0, count - base * count]
+    alone = [{"gaussians": 10, "small": p - a, "reduced": 0.0} for p, a in zip((30.0, 28.0), above, strict=True)]
+    runs = {"plain": plain, "lapsplat": ours}
+    result = {"runs": runs, "seconds": dict(zip(("lapsplat", "plain"), seconds, strict=True)), "alone": alone}
+    return [goal.reached for goal in claims_goals.goals("room", [result])]
+
+
+@pytest.mark.parametrize(
+    ("change", "missed"),
+    [
+        ({}, None),
+        ({"gain": 0.4}, 0),
+        ({"count": 61}, 0),
+        ({"seconds": (2.1, 2.0)}, 0),
+        ({"seconds": (None, 2.0)}, 0),
+        ({"base": 0.16}, 1),
+        ({"above": (-1.1, -0.9)}, 2),
+        ({"above": (-0.9, -1.1)}, 3),
+    ],
+)
+def test_each_goal_can_be_missed(change, missed):
+    assert [i for i, reached in enumerate(goals_with(**change)) if not reached] == ([] if missed is None else [missed])
+
+
+def test_a_model_of_one_size_is_judged_at_that_size():
+    run = levels_run()
+    found = claims_goals.at_own_size(run, 1)
+    view = run.cameras("test")[0]
+    camera = claims_goals._halved(view.camera, 1)
+    assert (camera.width, camera.height) == (view.camera.width // 2, view.camera.height // 2)
+    assert torch.equal(camera.K[:2], view.camera.K[:2] / 2) and camera.K[2, 2] == 1
+    # whole size: both figures are those of the full picture
+    whole = claims_goals.at_own_size(run, 0)
+    assert whole["small"] == pytest.approx(whole["reduced"]) and found["small"] != pytest.approx(whole["small"])
+    training = claims_goals.alone(Trial(SCENE, 30, 42), 1)
+    assert training.options["num_levels"] == 3 and training.options["coarse_growth_factor"] == 1.0

@@ -1,5 +1,6 @@
 """The weight w_s and the loss on the count, each on and off, with each gradient (the paper's Table 3)."""
 
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -52,9 +53,15 @@ def trainings(trial: Trial) -> dict[str, Training]:
 
 def measure(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
     """Quality and counts of every cell at both scales."""
+    return of_cells(lab, trial, trainings(trial))
+
+
+def of_cells(lab: Lab, trial: Trial, names: Iterable[str]) -> dict[str, Any]:
+    """The same of the cells with these names."""
+    cells = trainings(trial)
     return {
-        name: lab.step("ablation", [training], {"scales": SCALES}, lambda t=training: at_both(lab.run(t)))
-        for name, training in trainings(trial).items()
+        name: lab.step("ablation", [cells[name]], {"scales": SCALES}, lambda t=cells[name]: at_both(lab.run(t)))
+        for name in names
     }
 
 

@@ -219,18 +219,20 @@ def _no_jump(scene: str, results: Results) -> Verdict:
     )
 
 
+_FULL = ablation.name_of(True, "ste")
+_WITHOUT = {"w_s": ablation.name_of(False, "ste"), "L_reg": ablation.name_of(True, "off")}
+
+
 def _parts_matter(scene: str, results: Results) -> Verdict:
     """Each part alone left out of the full method, at s_v = 5: more Gaussians at no better PSNR, or a lower PSNR."""
-    full = ablation.name_of(True, "ste")
-    cells = {"w_s": ablation.name_of(False, "ste"), "L_reg": ablation.name_of(True, "off")}
 
     def change(name: str, figure: str) -> float:
-        return mean(results, lambda r: r["ablation"][name]["reduced"][figure] - r["ablation"][full]["reduced"][figure])
+        return mean(results, lambda r: r["ablation"][name]["reduced"][figure] - r["ablation"][_FULL]["reduced"][figure])
 
     words, matter = [], []
-    for part, name in cells.items():
+    for part, name in _WITHOUT.items():
         lost, more = change(name, "psnr"), change(name, "drawn")
-        count = mean(results, lambda r: r["ablation"][full]["reduced"]["drawn"])
+        count = mean(results, lambda r: r["ablation"][_FULL]["reduced"]["drawn"])
         words.append(f"without {part} {lost:+.2f} dB with {100 * more / count:+.0f} % Gaussians")
         matter.append(lost < -EQUAL or more > 0.05 * count)
 
@@ -245,8 +247,8 @@ def _parts_matter(scene: str, results: Results) -> Verdict:
 
 
 def _parts(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
-    scales = curve.measure(lab, trial, options)["clod"]
-    return {"ablation": ablation.measure(lab, trial, options), "curve": scales}
+    scales = curve.by_largest_scale(lab, trial, (1.0, DEFAULT_SCALE))
+    return {"ablation": ablation.of_cells(lab, trial, (_FULL, *_WITHOUT.values())), "curve": scales}
 
 
 CLAIMS: tuple[Claim, ...] = (

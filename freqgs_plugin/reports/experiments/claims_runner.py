@@ -1,30 +1,37 @@
 """`freqgs experiment claims`: trains what the papers' claims need, judges each, writes JSON and Markdown."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from freqgs_plugin.reports.bench.runner import check_folder, write_all
 from freqgs_plugin.reports.bench.tables import BenchTable, Row
-from freqgs_plugin.reports.experiments.claims import CLAIMS, RUNS, Claim, of_runs
+from freqgs_plugin.reports.experiments import claims_goals
+from freqgs_plugin.reports.experiments.claims import CLAIMS, RUNS, of_runs
+from freqgs_plugin.reports.experiments.goals import Goal, goal_markdown, goal_table, summary
 from freqgs_plugin.reports.experiments.lab import Lab, Missing, Tools
-from freqgs_plugin.reports.experiments.options import ClaimsOptions, ExperimentError, command_line
+from freqgs_plugin.reports.experiments.options import ClaimsOptions, ExperimentError, TrialOptions, command_line
 from freqgs_plugin.reports.experiments.page import circumstances
 from freqgs_plugin.reports.experiments.progress import Bars, Silent
 from freqgs_plugin.reports.experiments.runner import record_of, trials
 from freqgs_plugin.reports.experiments.seeds import shown
 from freqgs_plugin.reports.experiments.store import Store, alone
-from freqgs_plugin.reports.experiments.training import ExperimentScene
+from freqgs_plugin.reports.experiments.training import ExperimentScene, Trial
 from freqgs_plugin.reports.tables import finite_json
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 Found = Mapping[str, Mapping[str, list[dict[str, Any]]]]
-"""claim or `RUNS_ROW` -> scene -> what was measured, one per finished seed"""
-RUNS_ROW = Claim("runs", "", "", "", of_runs(*RUNS), lambda scene, results: _no_verdict())
+"""name in `MEASURED` -> scene -> what was measured, one per finished seed"""
+MEASURED: Mapping[str, Callable[[Lab, Trial, TrialOptions], dict[str, Any]]] = {
+    **{claim.name: claim.measure for claim in CLAIMS},
+    "goals": claims_goals.measure,
+    "runs": of_runs(*RUNS),
+}
+"""all that is measured for each scene and seed"""
 INTRODUCTION = """\
 What the two papers claim, each put to the test on the same scenes in the same run. *A* is the paper on frequency-aware
 decomposition (`lapsplat`), *B* the one on continuous level of detail (`clodsplat`). *plain* is the same code with one
@@ -33,10 +40,6 @@ the run as `lapsplat` and `clodsplat` do with our settings; with the paper's set
 
 A claim *holds* if at least half of the paper's figure is found in its direction, or what the column *condition* says.
 These are small scenes and short runs: a claim that does not hold here may hold on large scenes at 30,000 steps."""
-
-
-def _no_verdict() -> Any:
-    raise AssertionError("the row of runs is no claim")
 
 
 def run_claims(options: ClaimsOptions, scenes: Sequence[ExperimentScene], tools: Tools, console: "Console") -> Found:
@@ -51,16 +54,18 @@ def run_claims(options: ClaimsOptions, scenes: Sequence[ExperimentScene], tools:
         check_folder(folder)
     out.mkdir(parents=True, exist_ok=True)
     store, log = Store(out / "steps"), out / "load.log"
-    rows = (*CLAIMS, RUNS_ROW)
     if not options.page_only:
         try:
-            with alone(out), Bars(console, "freqgs experiment claims", len(rows) * len(scenes) * options.seeds) as bars:
+            with (
+                alone(out),
+                Bars(console, "freqgs experiment claims", len(MEASURED) * len(scenes) * options.seeds) as bars,
+            ):
                 lab = Lab(store, tools, bars, log)
                 for scene in scenes:
                     for trial in trials(options, scene):
-                        for claim in rows:
-                            bars.part(f"{claim.name}: {scene.name}, seed {trial.seed}")
-                            claim.measure(lab, trial, options)
+                        for name, measure in MEASURED.items():
+                            bars.part(f"{name}: {scene.name}, seed {trial.seed}")
+                            measure(lab, trial, options)
                             bars.advance()
                     _report(options, scenes, Lab(store, tools, Silent(), log, only_finished=True))
         except KeyboardInterrupt:
@@ -69,6 +74,7 @@ def run_claims(options: ClaimsOptions, scenes: Sequence[ExperimentScene], tools:
             raise
     found, files = _report(options, scenes, Lab(store, tools, Silent(), log, only_finished=True))
     console.print(verdict_table(found).rich())
+    console.print(goal_table(goals_of(found)))
     for path in files:
         console.print(str(path), soft_wrap=True, highlight=False, markup=False)
     return found
@@ -83,7 +89,8 @@ def _report(options: ClaimsOptions, scenes: Sequence[ExperimentScene], lab: Lab)
         claim.name: {scene: asdict(claim.judge(scene, results)) for scene, results in found[claim.name].items()}
         for claim in CLAIMS
     }
-    report = {**record, "verdicts": verdicts, "measured": found}
+    goals = [asdict(goal) for goal in goals_of(found)]
+    report = {**record, "verdicts": verdicts, "goals": goals, "measured": found}
     page = markdown_page(record, found).encode()
     files = {
         options.output_dir / "claims.json": json.dumps(finite_json(report), indent=1, allow_nan=False).encode() + b"\n",
@@ -96,16 +103,21 @@ def _report(options: ClaimsOptions, scenes: Sequence[ExperimentScene], lab: Lab)
 
 def collect(options: ClaimsOptions, scenes: Sequence[ExperimentScene], lab: Lab) -> Found:
     """All that is finished; `lab` does nothing anew."""
-    found: dict[str, dict[str, list[dict[str, Any]]]] = {claim.name: {} for claim in (*CLAIMS, RUNS_ROW)}
-    for claim in (*CLAIMS, RUNS_ROW):
+    found: dict[str, dict[str, list[dict[str, Any]]]] = {name: {} for name in MEASURED}
+    for name, measure in MEASURED.items():
         for scene in scenes:
             for trial in trials(options, scene):
                 try:
-                    result = claim.measure(lab, trial, options)
+                    result = measure(lab, trial, options)
                 except Missing:
                     continue
-                found[claim.name].setdefault(scene.name, []).append(result)
+                found[name].setdefault(scene.name, []).append(result)
     return found
+
+
+def goals_of(found: Found) -> list[Goal]:
+    """Of every scene that was measured for them."""
+    return [goal for scene, results in found["goals"].items() for goal in claims_goals.goals(scene, results)]
 
 
 def _judged(found: Found) -> list[Row]:
@@ -202,9 +214,12 @@ def markdown_page(record: Mapping[str, Any], found: Found) -> str:
         INTRODUCTION,
         f"{sum(judged)} of {len(judged)} hold.",
         table.markdown().replace("---:", "---"),
-        "## The runs",
     ]
-    for scene, results in found[RUNS_ROW.name].items():
+    if found["goals"]:
+        goals = goals_of(found)
+        parts += ["## Goals", claims_goals.INTRODUCTION, summary(goals), goal_markdown(goals)]
+    parts.append("## The runs")
+    for scene, results in found["runs"].items():
         runs = run_table(scene, results)
         parts += [f"### {scene}", runs.markdown(), runs.note]
     return "\n\n".join(parts) + "\n"

@@ -1,5 +1,6 @@
 """Quality and time against the number of Gaussians, for several s_max (the paper's Figures 3 and 4)."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -7,7 +8,7 @@ from freqgs_plugin.reports.bench.tables import BenchTable, Row, number
 from freqgs_plugin.reports.drawing import TrainedRun, draw
 from freqgs_plugin.reports.experiments.lab import Lab, LoadedRun
 from freqgs_plugin.reports.experiments.measures import at_scale, quality
-from freqgs_plugin.reports.experiments.options import TrialOptions
+from freqgs_plugin.reports.experiments.options import ClodOptions
 from freqgs_plugin.reports.experiments.plots import COLOURS, GREY, panels
 from freqgs_plugin.reports.experiments.section import Part, Results
 from freqgs_plugin.reports.experiments.seeds import mean, shown
@@ -32,17 +33,23 @@ without decay (see [Methods](methods.md#one-level)) of which the most opaque Gau
 the share."""
 
 
-def measure(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
+def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
     """One series per s_max, and the plain model's."""
-    series = {}
-    for largest in options.s_max:
-        training = trial.clod(largest)
-        more = {"scales": SCALES, "rounds": ROUNDS}
-        series[f"{largest:g}"] = lab.step("curve", [training], more, lambda t=training: _at_scales(lab.run(t)))
+    series = by_largest_scale(lab, trial, options.s_max)
     training = trial.plain()
     more = {"shares": SHARES, "rounds": ROUNDS}
     plain = lab.step("curve-plain", [training], more, lambda: _at_shares(lab.run(training)))
     return {"clod": series, "plain": plain}
+
+
+def by_largest_scale(lab: Lab, trial: Trial, s_max: Sequence[float]) -> dict[str, list[dict[str, Any]]]:
+    """One series per s_max."""
+    series = {}
+    for largest in s_max:
+        training = trial.clod(largest)
+        more = {"scales": SCALES, "rounds": ROUNDS}
+        series[f"{largest:g}"] = lab.step("curve", [training], more, lambda t=training: _at_scales(lab.run(t)))
+    return series
 
 
 def _at_scales(run: LoadedRun) -> list[dict[str, Any]]:

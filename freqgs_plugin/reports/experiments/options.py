@@ -27,8 +27,6 @@ class TrialOptions:
     """training steps of every run"""
     seeds: int = 1
     """runs of each setting, with seeds 42, 43 ...; tables show mean and spread. 2 where differences are under 0.3 dB"""
-    s_max: tuple[float, ...] = (1.0, 3.0, 5.0, 7.0)
-    """largest training scales that are compared (the sections curve and sigma)"""
     frames: int = 200
     """steps of each sweep in which jumps are looked for"""
     views: int = 36
@@ -48,8 +46,6 @@ class TrialOptions:
                 f"--steps and --seeds must be at least 1 and --frames at least 4, not {self.steps}, {self.seeds} and "
                 f"{self.frames}"
             )
-        if not self.s_max or not all(1 <= s < float("inf") for s in self.s_max):
-            raise ExperimentError(f"--s-max {self.s_max}: name at least one number, each of them 1 or more")
         names = [folder.resolve().name for folder in self.scenes] + ["demo"] * self.demo
         if len(set(names)) < len(names):
             raise ExperimentError(f"scenes are told apart by the names of their folders, and these are: {names}")
@@ -64,9 +60,13 @@ class ClodOptions(TrialOptions):
     only: tuple[str, ...] = SECTIONS
     """sections to run: curve, budget, pops, ablation, sigma, with spaces or commas between; others show what the
     folder holds of them"""
+    s_max: tuple[float, ...] = (1.0, 3.0, 5.0, 7.0)
+    """largest training scales that are compared (the sections curve and sigma)"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.s_max or not all(1 <= s < float("inf") for s in self.s_max):
+            raise ExperimentError(f"--s-max {self.s_max}: name at least one number, each of them 1 or more")
         _ = self.sections
 
     @property

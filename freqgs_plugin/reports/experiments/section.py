@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from freqgs_plugin.reports.bench.tables import BenchTable
 from freqgs_plugin.reports.experiments.goals import Goal
 from freqgs_plugin.reports.experiments.lab import Lab
-from freqgs_plugin.reports.experiments.options import Section, TrialOptions
+from freqgs_plugin.reports.experiments.options import ClodOptions, Section
 from freqgs_plugin.reports.experiments.training import Trial
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ Results = Sequence[dict[str, Any]]
 """what `measure` returned, one per seed; JSON values, so null for infinite numbers"""
 
 
-Measure = Callable[[Lab, Trial, TrialOptions], dict[str, Any]]
+Measure = Callable[[Lab, Trial, ClodOptions], dict[str, Any]]
 """does what is not done yet, for one scene and seed"""
 Tables = Callable[[str, Results], list[BenchTable]]
 """name of the scene, results of all seeds -> tables"""

@@ -7,7 +7,7 @@ import numpy as np
 from freqgs_plugin.reports.bench.tables import BenchTable, Row
 from freqgs_plugin.reports.experiments.lab import Lab, LoadedRun
 from freqgs_plugin.reports.experiments.measures import at_scale
-from freqgs_plugin.reports.experiments.options import TrialOptions
+from freqgs_plugin.reports.experiments.options import ClodOptions
 from freqgs_plugin.reports.experiments.plots import COLOURS, panels
 from freqgs_plugin.reports.experiments.section import Part, Results
 from freqgs_plugin.reports.experiments.seeds import shown
@@ -27,7 +27,7 @@ Sigma is in units of the reference distance; the larger it is, the longer a Gaus
 with larger s_max. *dead*: sigma <= 0, never drawn."""
 
 
-def measure(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
+def measure(lab: Lab, trial: Trial, options: ClodOptions) -> dict[str, Any]:
     """Quantiles and histograms per s_max."""
     found = {}
     for largest in options.s_max:
