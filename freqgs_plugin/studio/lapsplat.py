@@ -89,7 +89,7 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """whose opacities are reset: all levels' (the paper) or only the newest's (ours)"""
     restart_schedulers: bool = True
     """learning rate schedules begin anew with each level, as optimizers do (the paper)"""
-    base_share: float = 0.2
+    base_share: float = 1.0
     """share of all Gaussians that level 1 may have in the last stage: what its own small pictures need least moves to
     level 2, with its colour; 1: any (ours)"""
     new_level_opacity: float | None = None

@@ -19,7 +19,6 @@ PLAIN: Mapping[str, Any] = {
     "size_penalty": 0.0,
     "least_weight": 0.0,
     "least_views": 0,
-    "base_share": 1.0,
 }
 """settings of lapsplat that make it splatfacto's algorithm: one level, no decay"""
 
@@ -43,7 +42,6 @@ LAPSPLAT_PAPER: Mapping[str, Any] = {
     "size_penalty": 0.0,
     "least_weight": 0.0,
     "least_views": 0,
-    "base_share": 1.0,
 }
 """lapsplat as the paper on frequency-aware decomposition has it, where it says what it does"""
 

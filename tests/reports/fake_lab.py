@@ -69,7 +69,7 @@ class FakeTools:
     def defaults(self, method):
         ours = {"largest_scale": 5.0, "use_decay": True, "weigh_scales": True, "reg_weight": 1.0, "reg_gradient": "ste"}
         levels = {"dft_weight": 0.001, "lower_level_weight": 0.1, "signed_residuals": True}
-        levels |= {"num_levels": 3, "level_interval": 2500, "coarse_growth_factor": 1.8}
+        levels |= {"num_levels": 3, "base_share": 1.0, "level_interval": 2500, "coarse_growth_factor": 1.8}
         more = ours if method.startswith("clodsplat") else {**PLAIN, **levels}
         fields = {"seed": 42, "max_gaussians": 0, **more}
         return {name: repr(value) for name, value in {**fields, **self.changed}.items()}

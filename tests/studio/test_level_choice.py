@@ -75,3 +75,33 @@ def test_gains_are_differences_of_psnr(make_trainer):
 def test_impossible_settings(make_trainer, name):
     with pytest.raises(ValueError, match=f"{name} is nan"):
         make_trainer(**{name: float("nan")})
+
+
+def test_the_base_is_bounded_in_the_last_stage(make_trainer):
+    """And the picture of all levels stays the same."""
+    trainer = make_trainer(base_share=0.1)
+    model = trainer.pipeline.model
+    half = len(model.level) // 2
+    with torch.no_grad():
+        model.level[half:] = 3
+        # grey, so that no colour is clamped at 0
+        model.gauss_params["features_dc"][:half] = 0.0
+    model._stage = model._num_levels = 3
+    camera = trainer.pipeline.datamanager.train_dataset.cameras[:1]
+
+    def picture():
+        model.eval()
+        return model.get_outputs_for_camera(camera)["rgb"]
+
+    before = picture()
+    moved = model._bound_base()
+    counts = model.level_counts()
+    assert moved == counts[1] == half - counts[0] and counts[0] == int(0.1 * len(model.level)) > 0
+    assert torch.allclose(picture(), before, atol=1e-4)
+    assert model._bound_base() == 0
+
+
+@pytest.mark.parametrize("share", [0.0, -1.0, 1.5, float("nan")])
+def test_a_share_of_the_base_is_a_share(make_trainer, share):
+    with pytest.raises(ValueError, match="base_share is"):
+        make_trainer(base_share=share)
