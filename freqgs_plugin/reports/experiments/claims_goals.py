@@ -35,10 +35,11 @@ LEVELS = 3
 
 INTRODUCTION = f"""\
 `lapsplat` with its own settings, and the same with a bounded base (`base-share 0.2`: *small base*), against *plain*
-after as many steps and in no more time; and each prefix against a plain model that was trained for the prefix's size alone, for as many steps. Of such a model the better of two figures
-counts: its picture drawn at that size against the photograph averaged over blocks, as it was trained, or its full
-picture and the photograph reduced like the prefix's. Goals: {GAIN:g} dB with at most {FEWER:g} of the Gaussians, a base
-level of at most {100 * BASE:g} % of them, no prefix more than {NEAR:g} dB under its own model."""
+after as many steps and in no more time; and each prefix against a plain model that was trained for the prefix's size
+alone, for as many steps. Of such a model the better of two figures counts: its picture drawn at that size against the
+photograph averaged over blocks, as it was trained, or its full picture and the photograph reduced like the prefix's.
+Goals: {GAIN:g} dB with at most {FEWER:g} of the Gaussians, a base level of at most {100 * BASE:g} % of them, no prefix
+more than {NEAR:g} dB under its own model."""
 
 
 def alone(trial: Trial, level: int) -> Training:
