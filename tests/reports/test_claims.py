@@ -78,6 +78,7 @@ def test_all_claims_are_measured_once_and_shown(tmp_path, monkeypatch):
     docs = tmp_path / "docs" / "claims.md"
     docs.parent.mkdir()
     docs.write_text("# Claims\n\n<!-- claims room -->\n<!-- end of claims room -->\n\n<!-- claims hall -->\nkept\n")
+    docs.write_text(docs.read_text() + "<!-- goals room --><!-- end of goals room -->")
     options = ClaimsOptions(
         output_dir=tmp_path / "out", demo=False, scenes=(Path("room"),), frames=4, steps=30, docs=docs
     )
@@ -92,7 +93,8 @@ def test_all_claims_are_measured_once_and_shown(tmp_path, monkeypatch):
     assert len(tools.trained) == len({str(training) for training in tools.trained})
     page = docs.read_text(encoding="utf-8")
     whole = (tmp_path / "out" / "claims.md").read_text(encoding="utf-8")
-    assert whole.split("## room")[1].strip() in page and "<!-- claims hall -->\nkept" in page
+    tables = [part for part in whole.split("## room")[1].strip().split("\n\n") if part.startswith("|")]
+    assert len(tables) == 3 and all(table in page for table in tables) and "<!-- claims hall -->\nkept" in page
     for claim in CLAIMS:
         (row,) = (line for line in page.splitlines() if line.startswith(f"| {claim.name} "))
         assert row.endswith(("| holds |", "| does not hold |")) and claim.paper in row
@@ -120,10 +122,14 @@ def test_a_part_is_measured_alone_and_the_rest_is_said_to_be_missing(tmp_path):
 def test_a_page_without_a_scenes_place_is_refused_before_anything_is_trained(tmp_path):
     tools, console = FakeTools(tmp_path / "runs"), Console(file=io.StringIO())
     docs = tmp_path / "claims.md"
-    docs.write_text("# Claims\n")
     options = ClaimsOptions(output_dir=tmp_path / "out", demo=False, scenes=(Path("room"),), docs=docs)
-    with pytest.raises(BenchError, match="<!-- claims room -->"):
-        run_claims(options, [SCENE], tools.tools(), console)
+    for text, missing in (
+        ("# Claims", "claims room"),
+        ("<!-- claims room --><!-- end of claims room -->", "goals room"),
+    ):
+        docs.write_text(text)
+        with pytest.raises(BenchError, match=f"<!-- {missing} -->"):
+            run_claims(options, [SCENE], tools.tools(), console)
     assert tools.trained == [] and not (tmp_path / "out").exists()
 
 

@@ -28,9 +28,10 @@ RUNS_NOTE = (
 )
 
 
-def place_name(scene: str) -> str:
-    """What a page calls the place of a scene."""
-    return f"claims {scene}"
+def places(scene: str, record: Mapping[str, Any], found: Found) -> dict[str, str]:
+    """What fills a page: the name of each place -> Markdown; of what is wholly missing there is no place."""
+    texts = {f"claims {scene}": claims_text(scene, found), f"goals {scene}": goals_text(scene, found)}
+    return {name: f"{_circumstances(record)}\n\n{text}\n" for name, text in texts.items() if text}
 
 
 def verdicts(scene: str, found: Found) -> list[Row]:
@@ -98,31 +99,38 @@ def run_table(scene: str, results: Results) -> BenchTable:
     return BenchTable(f"claims-{scene}", scene, rows, columns, RUNS_NOTE)
 
 
-def scene_text(scene: str, record: Mapping[str, Any], found: Found) -> str:
-    """Claims, goals and runs of one scene; Markdown without a heading."""
+def claims_text(scene: str, found: Found) -> str:
+    """Claims and runs; Markdown, empty where none were measured."""
     rows = verdicts(scene, found)
     judged = [row["holds"] for row in rows if row["holds"] is not None]
-    goals = goals_of(scene, found)
-    seeds = ", ".join(map(str, record["seeds"]))
-    parts = [
-        circumstances(record),
-        f"{record['options']['steps']:,} steps, every eighth view held out, seed{'s' * (len(record['seeds']) > 1)} "
-        f"{seeds}; of several, figures are means ± half of the range. One run scatters by 0.1 to 0.5 dB.",
-    ]
-    if judged:
-        table = _claim_table(rows).markdown().replace("---:", "---")
-        parts += [f"{sum(judged)} of {len(judged)} claims hold.", table]
-    if goals:
-        parts += [summary(goals), goal_markdown(goals)]
+    if not judged:
+        return ""
+    parts = [f"{sum(judged)} of {len(judged)} claims hold.", _claim_table(rows).markdown().replace("---:", "---")]
     if found["runs"]:
         runs = run_table(scene, found["runs"])
         parts += [runs.markdown(), runs.note]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(parts)
+
+
+def goals_text(scene: str, found: Found) -> str:
+    """The same of the goals."""
+    goals = goals_of(scene, found)
+    return f"{summary(goals)}\n\n{goal_markdown(goals)}" if goals else ""
+
+
+def _circumstances(record: Mapping[str, Any]) -> str:
+    seeds = ", ".join(map(str, record["seeds"]))
+    return (
+        f"{circumstances(record)}\n\n"
+        f"{record['options']['steps']:,} steps, every eighth view held out, seed{'s' * (len(record['seeds']) > 1)} "
+        f"{seeds}; of several, figures are means ± half of the range. One run scatters by 0.1 to 0.5 dB."
+    )
 
 
 def markdown_page(scenes: Mapping[str, tuple[Mapping[str, Any], Found]]) -> str:
     """All scenes, each with its record."""
     parts = ["# The papers' claims", INTRODUCTION, claims_goals.INTRODUCTION]
     for scene, (record, found) in scenes.items():
-        parts += [f"## {scene}", scene_text(scene, record, found).rstrip()]
+        texts = (_circumstances(record), claims_text(scene, found), goals_text(scene, found))
+        parts += [f"## {scene}", *(text for text in texts if text)]
     return "\n\n".join(parts) + "\n"

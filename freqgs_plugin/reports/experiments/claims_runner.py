@@ -14,8 +14,7 @@ from freqgs_plugin.reports.experiments.claims_page import (
     Found,
     goals_of,
     markdown_page,
-    place_name,
-    scene_text,
+    places,
     verdict_table,
     verdicts,
 )
@@ -50,7 +49,7 @@ def run_claims(options: ClaimsOptions, scenes: Sequence[ExperimentScene], tools:
         BenchError: the page of `docs` lacks the place of a scene.
     """
     names = _chosen(options.only)
-    _check_page(options.docs, scenes)
+    _check_page(options.docs, scenes, names)
     out = options.output_dir
     check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -92,11 +91,12 @@ def _chosen(only: Iterable[str]) -> list[str]:
     return [name for name in MEASURED if not wanted or name in wanted]
 
 
-def _check_page(docs: Path | None, scenes: Sequence[ExperimentScene]) -> None:
+def _check_page(docs: Path | None, scenes: Sequence[ExperimentScene], names: Sequence[str]) -> None:
     """Before hours of work."""
     if docs is not None:
         page = docs.read_text(encoding="utf-8") if docs.is_file() else ""
-        check_places(page, [place_name(scene.name) for scene in scenes], docs)
+        parts = sorted({"goals" if name == "goals" else "claims" for name in names})
+        check_places(page, [f"{part} {scene.name}" for scene in scenes for part in parts], docs)
         check_folder(docs.parent)
 
 
@@ -129,7 +129,8 @@ def _report(
     if options.docs is not None:
         page = options.docs.read_text(encoding="utf-8")
         for name, (record, of_scene) in found.items():
-            page = fill(page, place_name(name), scene_text(name, record, of_scene))
+            for place, text in places(name, record, of_scene).items():
+                page = fill(page, place, text)
         files[options.docs] = page.encode()
     write_all(files)
     return found, list(files)
