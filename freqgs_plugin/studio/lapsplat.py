@@ -160,6 +160,9 @@ class LapSplatModel(FreqSplatModel):
             self._gain.hold_back(attributes.pipeline.datamanager)
         return callbacks
 
+    def level_choice(self) -> dict[str, Any]:
+        return dict(self._level_choice)
+
     def _make_schedule(self) -> Schedule:
         config, s = self.config, self._scale
         return replace(

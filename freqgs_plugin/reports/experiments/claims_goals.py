@@ -36,9 +36,9 @@ INTRODUCTION = f"""\
 `lapsplat` with its own settings, and the same with a bounded base (`base-share 0.2`: *small base*), against *plain*
 after as many steps; and each prefix against a plain model that was trained for the prefix's size alone, for as many
 steps. Of such a model the better of two figures counts: its picture drawn at that size against the photograph averaged
-over blocks, as it was trained, or its full picture and the photograph reduced like the prefix's. Goals: {GAIN:g} dB with
-at most {FEWER:g} of the Gaussians, a base level of at most {100 * BASE:g} % of them, no prefix more than {NEAR:g} dB
-under its own model."""
+over blocks, as it was trained, or its full picture and the photograph reduced like the prefix's. Goals: {GAIN:g} dB
+with at most {FEWER:g} of the Gaussians, a base level of at most {100 * BASE:g} % of them, no prefix more than
+{NEAR:g} dB under its own model."""
 
 
 def alone(trial: Trial, level: int) -> Training:
@@ -103,18 +103,14 @@ def _goals_of_run(scene: str, results: Results, name: str) -> list[Goal]:
         return 100 * r["runs"][name]["counts"][0] / r["runs"][name]["gaussians"]
 
     of_plain = shown(results, lambda r: base(r) * share(r), ".1f")
+    in_base = f"{shown(results, base, '.0f')} % (of plain's {of_plain} %)"
     figures = f"{shown(results, gain, '+.2f')} dB with {shown(results, share)} of the Gaussians"
     better = mean(results, gain) >= GAIN and mean(results, share) <= FEWER
     whole = f"{name}: at least {GAIN:g} dB above plain with at most {FEWER:g} of its Gaussians"
     small = f"{name}: at most {100 * BASE:g} % of the Gaussians in the base"
     return [
         Goal(scene, whole, figures, better),
-        Goal(
-            scene,
-            small,
-            f"{shown(results, base, '.0f')} % (of plain's {of_plain} %)",
-            mean(results, base) <= 100 * BASE,
-        ),
+        Goal(scene, small, in_base, mean(results, base) <= 100 * BASE),
         *(_prefix_goal(scene, results, name, level) for level in range(1, LEVELS)),
     ]
 
