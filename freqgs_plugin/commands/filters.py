@@ -50,7 +50,7 @@ def run_filters(options: FilterOptions, console: "Console") -> None:
     finally:
         partial.unlink(missing_ok=True)
     console.print(_table(rows, len(views)))
-    console.print(str(output), soft_wrap=True)
+    console.print(str(output), soft_wrap=True, highlight=False, markup=False)
 
 
 def _found(texts: Sequence[str]) -> dict[str, Filter]:
@@ -71,6 +71,7 @@ def _views(run: Any, wanted: int) -> list[Any]:
 
 
 def _table(rows: list[FilterRow], views: int) -> "Table":
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title=f"Filters, {views} views")
@@ -78,5 +79,5 @@ def _table(rows: list[FilterRow], views: int) -> "Table":
         table.add_column(heading, justify="left" if heading == "filter" else "right")
     for row in rows:
         changed, aside = number(row.changed), number(row.step_aside)
-        table.add_row(row.name, f"{row.gaussians:,}", changed, aside, f"{row.shared:.0%}")
+        table.add_row(escape(row.name), f"{row.gaussians:,}", changed, aside, f"{row.shared:.0%}")
     return table

@@ -65,7 +65,7 @@ def run_render(options: RenderOptions, console: "Console") -> None:
         if rate is not None:
             path = options.output_dir / VIDEO
             write_video(path, [folder.path(name) for name in shot.names], rate)
-            console.print(str(path), soft_wrap=True)
+            console.print(str(path), soft_wrap=True, highlight=False, markup=False)
     except MemoryError as error:
         width, height = max(((c.width, c.height) for c in shot.cameras), key=lambda size: size[0] * size[1])
         raise CommandError(f"{width}x{height} px do not fit into memory; give a smaller --size.") from error
@@ -91,6 +91,8 @@ def _check(options: RenderOptions) -> Amount | None:
             check_times(options.gaze_scale)
         if not Path(options.gaze).is_file():
             gaze_points(options.gaze, 1)
+    if options.focus_outside < 0:
+        raise ValueError(f"--focus-outside is {options.focus_outside}; give 0 (the object alone) or a level.")
     if options.filter != "none":
         find_filter(options.filter)
     return None if options.budget is None else parse_amount(options.budget)
@@ -102,8 +104,8 @@ def _check_pairs(options: RenderOptions) -> None:
     for needed, names in pairs.items():
         for name in names if getattr(options, needed) is None else ():
             if getattr(options, name) != getattr(RenderOptions, name):
-                raise ValueError(f"--{name.replace('_', '-')} does nothing without --{needed}; give --{needed}, too, or "
-                                 "leave it out.")  # fmt: skip
+                option = f"--{name.replace('_', '-')}"
+                raise ValueError(f"{option} does nothing without --{needed}; give --{needed}, too, or leave it out.")
 
 
 def _check_level(options: RenderOptions, scene: Scene) -> None:
@@ -113,7 +115,7 @@ def _check_level(options: RenderOptions, scene: Scene) -> None:
     if scene.gaussians.decay is not None:
         raise ValueError(f"--level {options.level:g}: this scene has no levels but a decay; use --detail.")
     has = "one level" if levels == 1 else f"{levels} levels"
-    raise ValueError(f"--level {options.level:g}: this scene has {has}; give at most {levels}, or leave it out for all.")
+    raise ValueError(f"--level {options.level:g}: this scene has {has}; give at most {levels}, or leave it out.")
 
 
 def _gazes(options: RenderOptions, frames: int) -> list[Point | None]:
@@ -268,6 +270,7 @@ def _draw_all(
 
 def _report(folder: FrameFolder, shot: Shot, total: int, along_path: bool, console: "Console") -> None:
     """A line per frame, or of many frames the range."""
+    from rich.markup import escape
     from rich.table import Table
 
     records = [folder.records[name] for name in shot.names]
@@ -278,11 +281,11 @@ def _report(folder: FrameFolder, shot: Shot, total: int, along_path: bool, conso
         table.add_column(heading, justify="right")
     if len(records) <= 20:
         for record in records:
-            table.add_row(record.name, f"{record.drawn:,}", f"{record.milliseconds:.1f}")
+            table.add_row(escape(record.name), f"{record.drawn:,}", f"{record.milliseconds:.1f}")
     for name, at in (("least", 0), ("median", len(records) // 2), ("most", -1)):
         table.add_row(name, f"{counts[at]:,}", f"{times[at]:.1f}")
     console.print(table)
     if empty:
-        names = ", ".join(empty[:5]) + (" ..." if len(empty) > 5 else "")
+        names = escape(", ".join(empty[:5])) + (" ..." if len(empty) > 5 else "")
         left = " The path may have left the scene." if along_path else ""
         console.print(f"[yellow]{len(empty)} frames draw no Gaussian: {names}.{left}")

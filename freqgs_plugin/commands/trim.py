@@ -76,7 +76,7 @@ def _trim(options: TrimOptions, console: "Console") -> None:
         "trim.md": f"# {old.name}, trimmed\n\n{text}",
     }
     config = write_trimmed(run, steps[-1].draft, old, folder.absolute(), more)
-    console.print(f"{config}", soft_wrap=True)
+    console.print(f"{config}", soft_wrap=True, highlight=False, markup=False)
 
 
 def _report(run: Any, steps: list[Step], options: TrimOptions, console: "Console") -> None:

@@ -65,6 +65,6 @@ def _check_view(path: Path, number: int, fov: float, pose: Float[Tensor, "3 4"])
         raise ValueError(f"{path}: view {number} has a field of view of {fov:g} degrees; it must be between 0 and 180.")
     if not bool(torch.isfinite(pose).all()) or abs(float(torch.linalg.det(pose[:, :3]))) < 1e-6:
         raise ValueError(
-            f"{path}: view {number} has no pose that a camera can have ({pose.tolist()}); save the path once more in the "
-            "viewer's Render tab."
+            f"{path}: view {number} has no pose that a camera can have ({pose.tolist()}); save the path once more in "
+            "the viewer's Render tab."
         )

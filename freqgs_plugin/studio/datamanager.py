@@ -10,6 +10,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from freqgs_plugin.io.check_images import SceneError, some
 from freqgs_plugin.io.check_scene import SceneSummary, check_colmap_scene, find_model
@@ -85,8 +86,8 @@ def _moved(data: Path) -> str:
     if data.is_absolute():
         return f"the scene's folder {data} is not there. {remedy}"
     return (
-        f"the scene's folder {data} is not in {Path.cwd()}: the run names it from where ns-train was started. Go there, "
-        f"or {remedy[0].lower()}{remedy[1:]}"
+        f"the scene's folder {data} is not in {Path.cwd()}: the run names it from where ns-train was started. Go "
+        f"there, or {remedy[0].lower()}{remedy[1:]}"
     )
 
 
@@ -94,7 +95,7 @@ def _look_at_colmap(parser: ColmapDataParserConfig, data: Path, thorough: bool) 
     """Point the parser at the model that is there, and check the scene."""
     found = find_model(data)
     if found is not None and find_model(data, (str(parser.colmap_path),)) is None:
-        CONSOLE.log(f"No COLMAP model in {data / parser.colmap_path}; using the one in {data / found}.")
+        CONSOLE.log(escape(f"No COLMAP model in {data / parser.colmap_path}; using the one in {data / found}."))
         parser.colmap_path = Path(found)
     if not thorough:
         return
@@ -121,7 +122,7 @@ def _report(summary: SceneSummary) -> None:
         f"{summary.num_points:,} points."
     )
     for warning in summary.warnings:
-        CONSOLE.log(f"[yellow]{warning}")
+        CONSOLE.log(f"[yellow]{escape(warning)}")
 
 
 def _look_at_transforms(data: Path) -> None:

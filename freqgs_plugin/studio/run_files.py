@@ -1,11 +1,18 @@
-"""What lies in a run's folder, looked at before nerfstudio loads it: what that says of damage names no remedy."""
+"""What lies in a run's folder: looked at before nerfstudio loads it, since what that says of damage names no remedy;
+and written whole, or not at all."""
 
+import os
 import re
+import shutil
+import tempfile
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
@@ -47,6 +54,46 @@ def latest_checkpoint(run: Path) -> tuple[Path, int]:
     path = folder / f"step-{max(steps):09d}.ckpt"
     _check_whole(path)
     return path, max(steps)
+
+
+@contextmanager
+def in_one_piece(run: Path) -> Iterator[Path]:
+    """A folder beside `run`, which becomes it at the end; where that fails, nothing is left of it.
+
+    Raises:
+        FileExistsError: `run` is there by then.
+    """
+    missing = [path for path in run.parents if not path.exists()]
+    run.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{run.name}-", dir=run.parent))
+    try:
+        partial.chmod(0o755)
+        yield partial
+        if run.exists():
+            raise FileExistsError(f"{run} has appeared meanwhile; name another --output-dir, or remove it.")
+        os.rename(partial, run)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        for path in missing:
+            if not any(path.iterdir()):
+                path.rmdir()
+
+
+def save_checkpoint(content: dict[str, Any], path: Path, run: Path) -> None:
+    """Write a checkpoint of the run that is going to lie at `run`.
+
+    Raises:
+        OSError: the disk is full; what torch says of that does not name it.
+    """
+    try:
+        torch.save(content, path)
+    except RuntimeError as error:
+        free = shutil.disk_usage(path.parent).free
+        reason = str(error).splitlines()[0]
+        raise OSError(
+            f"{path.name} cannot be written to {run} ({reason}); {free / 1e6:,.0f} MB are free there. Make room, or "
+            "name another --output-dir."
+        ) from error
 
 
 def _check_whole(path: Path) -> None:

@@ -43,7 +43,7 @@ def test_what_cannot_be_read(tmp_path):
     with pytest.raises(ValueError, match=r"bad\.txt is no text"):
         gaze_points(str(tmp_path / "bad.txt"), 2)
     (tmp_path / "bad.txt").write_text("x" * 1000)
-    with pytest.raises(ValueError, match="x{40}'; it must be"):
+    with pytest.raises(ValueError, match=r"x{40}'; it must be"):
         gaze_points(str(tmp_path / "bad.txt"), 2)
 
 

@@ -53,6 +53,9 @@ def test_levels_of_held_out_views(trained, tmp_path, render):
     assert done.code == 0, str(done)
     base = frames(tmp_path / "base")
     assert {r["drawn"] for r in base.values()} == {int((run.gaussians.level == 1).sum())}
+    # what rich takes for markup is part of the name
+    text = render("--load-config", trained, "--output-dir", tmp_path / "[" / "b]", "--video", "always")
+    assert str(tmp_path / "[" / "b]" / "video.mp4") in text
     render("--load-config", trained, "--output-dir", tmp_path / "all")
     for view in run.cameras("test"):
         name = view.name.rsplit(".", 1)[0]
@@ -162,6 +165,8 @@ def test_focus_from_masks_and_from_a_box(trained, tmp_path, render):
         (("--gaze", "0.5,0.5", "--gaze-scale", "100000"), "from 1 to 32"),
         (("--gaze-scale", "2"), "give --gaze"),
         (("--gaze-sigma", "0.2"), "--gaze-sigma does nothing without --gaze"),
+        (("--focus", "nowhere", "--focus-outside", "-3"), "--focus-outside is -3"),
+        (("--load-config", "RUN", "--focus", "text: "), "names nothing"),
         (("--focus-outside", "0"), "--focus-outside does nothing without --focus"),
         (("--load-config", "RUN", "--level", "3.5"), "--level 3.5: this scene has 3 levels; give at most 3"),
         (("--load-config", "FADED", "--level", "2"), "--level 2: this scene has no levels but a decay; use --detail"),
@@ -177,7 +182,7 @@ def test_focus_from_masks_and_from_a_box(trained, tmp_path, render):
         (("--load-config", "RUN", "--focus", "nowhere:1,2"), "the view 'nowhere'"),
         (("--load-config", "RUN", "--focus", "view_001:1,2,3"), "3 numbers"),
         (("--load-config", "RUN", "--focus", "view_001:900,2"), "lies outside of the 80x64 image"),
-        (("--load-config", "RUN", "--focus", "text:ball", "--segmenter-weights", "nowhere"), "nowhere"),
+        (("--load-config", "RUN", "--focus", "text:ball", "--segmenter-weights", "nowhere"), "given with --seg"),
     ],
 )
 def test_what_cannot_be_drawn_is_said(trained, faded, tmp_path, monkeypatch, capsys, arguments, message):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from freqgs_plugin.studio.run_files import latest_checkpoint, read_config
+from freqgs_plugin.studio.run_files import in_one_piece, latest_checkpoint, read_config, save_checkpoint
 
 
 @pytest.fixture
@@ -46,5 +46,34 @@ def test_a_config_of_something_else(tmp_path, text):
 
 
 def test_no_config(tmp_path):
-    with pytest.raises(FileNotFoundError, match="is no file; name the config.yml"):
+    with pytest.raises(FileNotFoundError, match=r"is no file; name the config\.yml"):
         read_config(tmp_path)
+
+
+def test_a_run_appears_whole(tmp_path):
+    run = tmp_path / "new" / "lapsplat" / "run"
+    with in_one_piece(run) as partial:
+        (partial / "config.yml").write_text("x")
+        assert not run.exists()
+    assert [path.name for path in run.parent.iterdir()] == ["run"] and (run / "config.yml").is_file()
+    # two imports in the same second
+    with pytest.raises(FileExistsError, match="has appeared meanwhile"), in_one_piece(run):
+        pass
+    assert [path.name for path in run.parent.iterdir()] == ["run"] and len(list(run.iterdir())) == 1
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError])
+def test_nor_does_a_part_of_it_stay(tmp_path, failure):
+    with pytest.raises(failure), in_one_piece(tmp_path / "new" / "lapsplat" / "run") as partial:
+        (partial / "config.yml").write_text("x")
+        raise failure
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_named(tmp_path, monkeypatch):
+    def fail(content, path):
+        raise RuntimeError("unexpected pos 64 vs 0")
+
+    monkeypatch.setattr(torch, "save", fail)
+    with pytest.raises(OSError, match=r"step-000000000\.ckpt cannot be written to .*run .* Make room"):
+        save_checkpoint({}, tmp_path / "step-000000000.ckpt", tmp_path / "run")

@@ -12,7 +12,6 @@ from running import command
 from freqgs_plugin.cli import main
 from freqgs_plugin.io.init_source import read_init_source
 from freqgs_plugin.reports.trim import trimmer
-from freqgs_plugin.studio import trimmed
 from freqgs_plugin.studio.checkpoint import load_run
 from freqgs_plugin.studio.viewing import psnr, show
 
@@ -232,7 +231,7 @@ def test_photographs_named_from_elsewhere(trained, tmp_path, monkeypatch, refuse
     config = own / "config.yml"
     config.write_text(re.sub(r"(?<=PosixPath\n)(- .*\n)+(?=experiment_name)", "- scene\n", config.read_text(), count=1))
     monkeypatch.chdir(tmp_path)
-    assert f"scene is not in {tmp_path}: the run names it from where ns-train was started" in refused("--load-config", config)
+    assert f"scene is not in {tmp_path}: the run names it from where ns-train" in refused("--load-config", config)
 
 
 @pytest.mark.parametrize("failure", [RuntimeError("PytorchStreamWriter failed writing file"), KeyboardInterrupt()])
@@ -244,7 +243,7 @@ def test_a_full_disk_and_an_interrupt_leave_nothing(trained, tmp_path, monkeypat
             path.write_bytes(b"half")
             raise failure
 
-    monkeypatch.setattr(trimmed.torch, "save", fail)
+    monkeypatch.setattr(torch, "save", fail)
     monkeypatch.setattr(trimmer, "_RETRIES", 0)
     with pytest.raises(SystemExit) as ended:
         main(["trim", "--load-config", str(trained), "--output-dir", str(out)])
