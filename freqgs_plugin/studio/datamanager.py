@@ -10,10 +10,12 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from freqgs_plugin.io.check_images import SceneError, some
 from freqgs_plugin.io.check_scene import SceneSummary, check_colmap_scene, find_model
 from freqgs_plugin.studio.cameras import to_camera
+from freqgs_plugin.studio.view_names import view_names
 from freqgs_plugin.types import Camera
 
 NAMED_CAMERAS = "named_cameras"
@@ -45,6 +47,8 @@ class SceneDatamanager(FullImageDatamanager):
         self.held_back: set[int] = set()
         parser = config.dataparser
         data = Path(config.data if config.data is not None else parser.data)
+        if test_mode != "val" and not data.exists():
+            raise SceneError(_moved(data))
         if isinstance(parser, ColmapDataParserConfig):
             _look_at_colmap(parser, data, thorough=test_mode == "val")
         elif isinstance(parser, NerfstudioDataParserConfig):
@@ -55,13 +59,13 @@ class SceneDatamanager(FullImageDatamanager):
         self.train_dataset.metadata[NAMED_CAMERAS] = self.named_cameras
 
     def named_cameras(self) -> tuple[list[str], list[Camera]]:
-        """File names and cameras of the views trained on, and then of those held out, on the CPU."""
-        names, cameras = [], []
+        """Names and cameras of the views trained on, and then of those held out, on the CPU."""
+        files, cameras = [], []
         # looked at first: nerfstudio undistorts images and cameras as it reads them
         for _, dataset in ((self.cached_train, self.train_dataset), (self.cached_eval, self.eval_dataset)):
-            names += [Path(file).name for file in dataset.image_filenames]
+            files += dataset.image_filenames
             cameras += [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
-        return names, cameras
+        return view_names(files), cameras
 
     def sample_train_cameras(self) -> list[int]:
         """nerfstudio's order of training views, without those held back."""
@@ -73,11 +77,25 @@ class SceneDatamanager(FullImageDatamanager):
         self.train_unseen_cameras = self.sample_train_cameras()
 
 
+def _moved(data: Path) -> str:
+    """Of a run, which knows its scene by its folder alone."""
+    remedy = (
+        "Move it back, or name its new place in the run's config.yml: there, put one line `- /NEW/FOLDER` in place of "
+        "the lines that begin with `- `, one for each part of the old path, below the first `data:` that holds it."
+    )
+    if data.is_absolute():
+        return f"the scene's folder {data} is not there. {remedy}"
+    return (
+        f"the scene's folder {data} is not in {Path.cwd()}: the run names it from where ns-train was started. Go "
+        f"there, or {remedy[0].lower()}{remedy[1:]}"
+    )
+
+
 def _look_at_colmap(parser: ColmapDataParserConfig, data: Path, thorough: bool) -> None:
     """Point the parser at the model that is there, and check the scene."""
     found = find_model(data)
     if found is not None and find_model(data, (str(parser.colmap_path),)) is None:
-        CONSOLE.log(f"No COLMAP model in {data / parser.colmap_path}; using the one in {data / found}.")
+        CONSOLE.log(escape(f"No COLMAP model in {data / parser.colmap_path}; using the one in {data / found}."))
         parser.colmap_path = Path(found)
     if not thorough:
         return
@@ -104,7 +122,7 @@ def _report(summary: SceneSummary) -> None:
         f"{summary.num_points:,} points."
     )
     for warning in summary.warnings:
-        CONSOLE.log(f"[yellow]{warning}")
+        CONSOLE.log(f"[yellow]{escape(warning)}")
 
 
 def _look_at_transforms(data: Path) -> None:
