@@ -133,11 +133,11 @@ def measured(scene: Path) -> str:
 def measure(scenes: list[Path]) -> None:
     from freqgs_plugin.reports.timing import environment
 
-    now = environment()
-    names = " ".join(scene.name for scene in scenes)
-    head = f"*Measured {now['date'][:10]}, commit {now['commit']}, {now['hardware']['processor']}, "
-    head += f"{now['hardware']['cores']} cores, {now['hardware']['threads']} thread, no GPU, beside other work (load average "
-    head += f"{os.getloadavg()[2]:.1f}): `python docs/measure_photographs.py measure {names}`.*"
+    now, load_average = environment(), os.getloadavg()[2]
+    hardware, names = now["hardware"], " ".join(scene.name for scene in scenes)
+    head = f"*Measured {now['date'][:10]}, commit {now['commit']}, {hardware['processor']}, {hardware['cores']} cores, "
+    head += f"{hardware['threads']} thread, no GPU, beside other work (load average {load_average:.1f}): "
+    head += f"`python docs/measure_photographs.py measure {names}`.*"
     text = "\n\n".join([head, *map(measured, scenes)])
     before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     PAGE.write_text(f"{before}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
