@@ -1,6 +1,7 @@
 """nerfstudio's full-image datamanager, after a look at the scene: what is wrong is said before training starts."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +16,8 @@ from rich.markup import escape
 from freqgs_plugin.io.check_images import SceneError, some
 from freqgs_plugin.io.check_scene import SceneSummary, check_colmap_scene, find_model
 from freqgs_plugin.studio.cameras import to_camera
+from freqgs_plugin.studio.disk_views import DiskViews
+from freqgs_plugin.studio.image_cache import EvalPairs, Where, choose_place, scene_folder
 from freqgs_plugin.studio.view_names import view_names
 from freqgs_plugin.types import Camera
 
@@ -24,10 +27,19 @@ NAMED_CAMERAS = "named_cameras"
 
 @dataclass
 class SceneDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's fields; images are cached as 8 bit."""
+    """nerfstudio's fields, and where photographs are kept."""
 
     _target: type = field(default_factory=lambda: SceneDatamanager)
     cache_images_type: Literal["uint8", "float32"] = "uint8"
+    """of a cached photograph: 3 or 12 bytes per pixel (nerfstudio's default is float32)"""
+    cache_images_where: Where = "auto"
+    """where photographs are kept at the size used: memory, disk (written once, mapped into memory when looked at), or
+    auto: memory if all of them take at most cache_images_share of what is available, else disk (ours)"""
+    cache_images_share: float = 0.5
+    """share of the available memory up to which auto keeps photographs there, in (0, 1] (ours)"""
+    cache_images_dir: Path | None = None
+    """where disk puts a folder for each scene; None: freqgs/images in the user's cache, $XDG_CACHE_HOME or ~/.cache
+    (ours)"""
 
 
 class SceneDatamanager(FullImageDatamanager):
@@ -45,6 +57,8 @@ class SceneDatamanager(FullImageDatamanager):
         **kwargs: Any,
     ):
         self.held_back: set[int] = set()
+        if not 0 < config.cache_images_share <= 1:
+            raise ValueError(f"cache-images-share is {config.cache_images_share}; it is a share of memory in (0, 1].")
         parser = config.dataparser
         data = Path(config.data if config.data is not None else parser.data)
         if test_mode != "val" and not data.exists():
@@ -66,6 +80,27 @@ class SceneDatamanager(FullImageDatamanager):
             files += dataset.image_filenames
             cameras += [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
         return view_names(files), cameras
+
+    @cached_property
+    def images_on_disk(self) -> bool:
+        """Whether photographs are kept on disk: decided, and said, when the first of them is needed."""
+        return choose_place(self.config, (self.train_dataset, self.eval_dataset), self.device) == "disk"
+
+    def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> Any:
+        if not self.images_on_disk:
+            return super()._load_images(split, cache_images_device)
+        dataset = self.train_dataset if split == "train" else self.eval_dataset
+        views = DiskViews(dataset, self.config.cache_images_type, scene_folder(self.config))
+        cameras = self.train_dataset.cameras
+        self.train_cameras = cameras.to(self.device) if cache_images_device == "gpu" else cameras
+        return views
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> Any:
+        """Cameras and images held out; from disk one by one, not all on the device at once."""
+        if not self.images_on_disk:
+            return super().fixed_indices_eval_dataloader
+        return EvalPairs(self.cached_eval, self.eval_dataset.cameras, self.device)
 
     def sample_train_cameras(self) -> list[int]:
         """nerfstudio's order of training views, without those held back."""
