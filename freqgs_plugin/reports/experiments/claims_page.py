@@ -30,8 +30,23 @@ RUNS_NOTE = (
 
 def places(scene: str, record: Mapping[str, Any], found: Found) -> dict[str, str]:
     """What fills a page: the name of each place -> Markdown; of what is wholly missing there is no place."""
-    texts = {f"claims {scene}": claims_text(scene, found), f"goals {scene}": goals_text(scene, found)}
-    return {name: f"{_circumstances(record)}\n\n{text}\n" for name, text in texts.items() if text}
+    texts = _texts(scene, found)
+    return {f"{name} {scene}": f"{_circumstances(record)}\n\n{text}\n" for name, text in texts.items() if text}
+
+
+def place_of(name: str) -> str:
+    """The place of a claim, of "goals" or "runs": what one paper claims stands together."""
+    return name if name in ("goals", "runs") else f"claims-{name[0]}"
+
+
+def _texts(scene: str, found: Found) -> dict[str, str]:
+    """Place -> Markdown; empty where nothing of it was measured."""
+    papers = dict.fromkeys(place_of(claim.name) for claim in CLAIMS)
+    return {
+        **{place: claims_text(scene, found, place) for place in papers},
+        "goals": goals_text(scene, found),
+        "runs": runs_text(scene, found),
+    }
 
 
 def verdicts(scene: str, found: Found) -> list[Row]:
@@ -99,21 +114,26 @@ def run_table(scene: str, results: Results) -> BenchTable:
     return BenchTable(f"claims-{scene}", scene, rows, columns, RUNS_NOTE)
 
 
-def claims_text(scene: str, found: Found) -> str:
-    """Claims and runs; Markdown, empty where none were measured."""
-    rows = verdicts(scene, found)
+def claims_text(scene: str, found: Found, place: str) -> str:
+    """The claims of one paper."""
+    rows = [row for row in verdicts(scene, found) if place_of(row["claim"].name) == place]
     judged = [row["holds"] for row in rows if row["holds"] is not None]
     if not judged:
         return ""
-    parts = [f"{sum(judged)} of {len(judged)} claims hold.", _claim_table(rows).markdown().replace("---:", "---")]
-    if found["runs"]:
-        runs = run_table(scene, found["runs"])
-        parts += [runs.markdown(), runs.note]
-    return "\n\n".join(parts)
+    table = _claim_table(rows).markdown().replace("---:", "---")
+    return f"{sum(judged)} of {len(judged)} claims that were measured hold.\n\n{table}"
+
+
+def runs_text(scene: str, found: Found) -> str:
+    """Every run's figures."""
+    if not found["runs"]:
+        return ""
+    runs = run_table(scene, found["runs"])
+    return f"{runs.markdown()}\n\n{runs.note}"
 
 
 def goals_text(scene: str, found: Found) -> str:
-    """The same of the goals."""
+    """What was aimed at."""
     goals = goals_of(scene, found)
     return f"{summary(goals)}\n\n{goal_markdown(goals)}" if goals else ""
 
@@ -131,6 +151,5 @@ def markdown_page(scenes: Mapping[str, tuple[Mapping[str, Any], Found]]) -> str:
     """All scenes, each with its record."""
     parts = ["# The papers' claims", INTRODUCTION, claims_goals.INTRODUCTION]
     for scene, (record, found) in scenes.items():
-        texts = (_circumstances(record), claims_text(scene, found), goals_text(scene, found))
-        parts += [f"## {scene}", *(text for text in texts if text)]
+        parts += [f"## {scene}", _circumstances(record), *(text for text in _texts(scene, found).values() if text)]
     return "\n\n".join(parts) + "\n"

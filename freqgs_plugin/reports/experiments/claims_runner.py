@@ -14,6 +14,7 @@ from freqgs_plugin.reports.experiments.claims_page import (
     Found,
     goals_of,
     markdown_page,
+    place_of,
     places,
     verdict_table,
     verdicts,
@@ -95,7 +96,7 @@ def _check_page(docs: Path | None, scenes: Sequence[ExperimentScene], names: Seq
     """Before hours of work."""
     if docs is not None:
         page = docs.read_text(encoding="utf-8") if docs.is_file() else ""
-        parts = sorted({"goals" if name == "goals" else "claims" for name in names})
+        parts = dict.fromkeys(place_of(name) for name in names)
         check_places(page, [f"{part} {scene.name}" for scene in scenes for part in parts], docs)
         check_folder(docs.parent)
 

@@ -90,8 +90,8 @@ class ClaimsOptions(TrialOptions):
     """what to measure: A-a, A-b ... B-d, goals, runs, with spaces or commas between; without it everything. What else
     the folder holds is shown as well"""
     docs: Path | None = None
-    """page in which each scene's tables are filled in, between the comments <!-- claims SCENE -->, <!-- goals SCENE -->
-    and their ends"""
+    """page in which each scene's tables are filled in, between the comments <!-- claims-A SCENE -->, <!-- claims-B
+    SCENE -->, <!-- goals SCENE -->, <!-- runs SCENE --> and their ends"""
 
 
 def command_line(options: TrialOptions, experiment: str) -> str:
