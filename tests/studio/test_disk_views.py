@@ -5,6 +5,7 @@ import gc
 import os
 import re
 import threading
+import time
 import weakref
 from pathlib import Path
 
@@ -150,16 +151,23 @@ def test_a_damaged_photograph_is_not_blamed_on_the_disk(manager, own_scene):
         made.cached_train  # noqa: B018
 
 
-def test_two_at_once_write_each_view_once(manager, monkeypatch, tmp_path):
+def test_two_at_once_write_each_view_once(manager, monkeypatch, said):
     made, wrote, results = [manager(), manager()], [], []
     write = disk_views.write_view
-    monkeypatch.setattr(disk_views, "write_view", lambda path, *rest: wrote.append(path) or write(path, *rest))
+
+    def slowly(path, *rest):
+        wrote.append(path)
+        time.sleep(0.05)
+        return write(path, *rest)
+
+    monkeypatch.setattr(disk_views, "write_view", slowly)
     threads = [threading.Thread(target=lambda one=one: results.append(everything(one))) for one in made]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
     assert len(wrote) == len(set(wrote)) == 9 and equal(*results)
+    assert any(line.startswith("Another process is caching photographs in ") for line in said)
 
 
 def test_leftovers_of_a_killed_process_are_removed(manager, tmp_path):
