@@ -26,8 +26,9 @@ def docstrings(config_class: type) -> dict[str, str]:
 
 
 def table() -> str:
-    """Markdown: the fields that this package defines, those of each method and those of both, with their defaults."""
+    """Markdown: the fields that this package defines, with their defaults: of each method, of both, of photographs."""
     from freqgs_plugin.studio.config import FreqSplatModelConfig
+    from freqgs_plugin.studio.datamanager import SceneDatamanagerConfig
     from method_configs.clodsplat import clodsplat
     from method_configs.lapsplat import lapsplat
 
@@ -37,6 +38,8 @@ def table() -> str:
     for name, config in methods.items():
         parts.append(f"`{name}`:\n\n{_rows(docstrings(type(config)), [config])}")
     parts.append(f"Both methods:\n\n{_rows(shared, list(methods.values()))}")
+    images = SceneDatamanagerConfig()
+    parts.append(f"Photographs (`--pipeline.datamanager.`):\n\n{_rows(docstrings(type(images)), [images])}")
     return "\n\n".join(parts)
 
 

@@ -1,5 +1,6 @@
 """The `freqgs` command. Heavy imports happen inside of the commands, so that `--help` is quick."""
 
+import errno
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -188,8 +189,15 @@ def main(arguments: list[str] | None = None) -> None:
     except Exception as error:
         if not _expected(error):
             raise
-        print(f"freqgs: {error}", file=sys.stderr)
+        print(f"freqgs: {_told(error)}", file=sys.stderr)
         sys.exit(1)
+
+
+def _told(error: Exception) -> str:
+    """The message, with the remedy where the system's own has none."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename is None:
+        return f"the disk is full ({error.strerror}). Make room there, or write to another one."
+    return str(error)
 
 
 def _one_of(commands: Mapping[str, Any]) -> Any:

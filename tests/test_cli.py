@@ -1,3 +1,4 @@
+import errno
 import json
 import subprocess
 import sys
@@ -55,6 +56,17 @@ def test_unexpected_errors_keep_their_traceback(tmp_path, monkeypatch):
     monkeypatch.setattr(demo_run, "run_demo", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         cli.main(["demo", "--output-dir", str(tmp_path / "out")])
+
+
+def test_a_full_disk_is_named(tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(demo_run, "run_demo", full)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["demo", "--output-dir", str(tmp_path / "out")])
+    error = capsys.readouterr().err
+    assert stop.value.code == 1 and "the disk is full" in error and "Make room" in error
 
 
 @pytest.mark.parametrize(

@@ -204,8 +204,8 @@ def test_dependencies_are_what_is_imported():
         p.name for p in sources if re.search(r"^\s*(?:import|from) transformers", p.read_text("utf-8"), re.MULTILINE)
     ]
     assert where == ["clipseg.py"], "nothing else may need an extra"
-    # loaded by path
-    assert declared - imported == {"tbb"}, "declared, not imported"
+    # loaded by path, and kept from a version that nerfstudio cannot import everywhere
+    assert declared - imported == {"tbb", "open3d"}, "declared, not imported"
 
 
 def test_a_wheel_works_by_itself(tmp_path):

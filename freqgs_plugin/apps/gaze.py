@@ -62,7 +62,10 @@ def _read(path: Path) -> Sequence[Point]:
         raise FileNotFoundError(
             f"gaze is '{path}', which is no file; give x,y (shares of the image), a file or {AUTO}."
         )
-    text = path.read_text(encoding="utf-8")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeError as error:
+        raise ValueError(f"{path} is no text ({error}); give one gaze per line, as in 0.5,0.4.") from error
     try:
         lines = [f"{x},{y}" for x, y in json.loads(text)]
     except (ValueError, TypeError):
@@ -76,7 +79,7 @@ def _point(text: str, where: str) -> Point:
     try:
         x, y = (float(part) for part in re.split(r"[,\s]+", text.strip()))
     except ValueError:
-        raise ValueError(f"{where} is '{text}'; it must be two numbers, as in 0.5,0.4.") from None
+        raise ValueError(f"{where} is '{text[:40]}'; it must be two numbers, as in 0.5,0.4.") from None
     if not (0 <= x <= 1 and 0 <= y <= 1) or not math.isfinite(x + y):
         raise ValueError(
             f"{where} is {x:g},{y:g}, outside of the image; give shares of its width and height, from 0,0 (upper left) "

@@ -1,8 +1,11 @@
 """`freqgs filters`: a contact sheet of filters from several views."""
 
 import os
+from collections import Counter
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from freqgs_plugin.apps.filters import Filter
 from freqgs_plugin.apps.own_filters import filter_label, find_filter
 from freqgs_plugin.commands.options import CommandError, FilterOptions
 from freqgs_plugin.reports.bench.runner import check_folder
@@ -32,7 +35,7 @@ def run_filters(options: FilterOptions, console: "Console") -> None:
         raise CommandError(f"--views is {options.views}; it must be at least 1.")
     partial = output.with_name(f".{output.name}")
     try:
-        filters = {filter_label(text): find_filter(text) for text in options.filters}
+        filters = _found(options.filters)
         check_folder(output.parent)
         run = load(options.load_config)
         views = _views(run, options.views)
@@ -47,7 +50,14 @@ def run_filters(options: FilterOptions, console: "Console") -> None:
     finally:
         partial.unlink(missing_ok=True)
     console.print(_table(rows, len(views)))
-    console.print(str(output), soft_wrap=True)
+    console.print(str(output), soft_wrap=True, highlight=False, markup=False)
+
+
+def _found(texts: Sequence[str]) -> dict[str, Filter]:
+    """By label, or where several have the same, by all that was typed."""
+    labels = {text: filter_label(text) for text in texts}
+    often = Counter(labels.values())
+    return {label if often[label] == 1 else text: find_filter(text) for text, label in labels.items()}
 
 
 def _views(run: Any, wanted: int) -> list[Any]:
@@ -61,6 +71,7 @@ def _views(run: Any, wanted: int) -> list[Any]:
 
 
 def _table(rows: list[FilterRow], views: int) -> "Table":
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title=f"Filters, {views} views")
@@ -68,5 +79,5 @@ def _table(rows: list[FilterRow], views: int) -> "Table":
         table.add_column(heading, justify="left" if heading == "filter" else "right")
     for row in rows:
         changed, aside = number(row.changed), number(row.step_aside)
-        table.add_row(row.name, f"{row.gaussians:,}", changed, aside, f"{row.shared:.0%}")
+        table.add_row(escape(row.name), f"{row.gaussians:,}", changed, aside, f"{row.shared:.0%}")
     return table

@@ -15,17 +15,20 @@ from freqgs_plugin.apps.own_filters import filter_file, find_filter
 from freqgs_plugin.apps.rescaled import check_times, render_rescaled, suitable
 from freqgs_plugin.apps.segmenters import SegmenterError
 from freqgs_plugin.commands.focusing import focus_on
-from freqgs_plugin.commands.frames import FrameFolder, FrameRecord, write_video
+from freqgs_plugin.commands.frames import LONGEST, FrameFolder, FrameRecord, check_rate, write_video
 from freqgs_plugin.commands.options import CommandError, RenderOptions
-from freqgs_plugin.commands.scene import Scene, Shot, open_scene, shots
+from freqgs_plugin.commands.scene import Scene, Shot, check_size, open_scene, shots
 from freqgs_plugin.functional.attenuation import Attenuation, DistanceDecay, LevelCut, Product
 from freqgs_plugin.functional.budget import DecayBudget, LevelBudget, in_view
 from freqgs_plugin.functional.cost import RenderTime, calibrate
 from freqgs_plugin.rendering.render import render
+from freqgs_plugin.reports.bench.runner import check_folder
 from freqgs_plugin.types import Camera, Gaussians, Rendering
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+VIDEO = "video.mp4"
 
 
 @dataclass(frozen=True)
@@ -42,45 +45,77 @@ def run_render(options: RenderOptions, console: "Console") -> None:
     Raises:
         CommandError: options that contradict each other or the scene.
         OSError: inputs that are not there, or an output folder that cannot be used.
+        KeyboardInterrupt: passed on, after a message.
     """
     try:
         amount = _check(options)
+        check_folder(options.output_dir)
         scene = open_scene(options.load_config, options.ply, options.rasterizer)
         shot = shots(scene, options.path, options.split, options.size)
         gazes = _gazes(options, len(shot.cameras))
         rate = _rate(options, shot)
+        _check_level(options, scene)
         look = _look(options, amount, scene, shot, console)
-        folder = FrameFolder(options.output_dir, _settings(options))
+        files = [f"{name}.png" for name in shot.names] + [VIDEO] * (rate is not None)
+        folder = FrameFolder(options.output_dir, _settings(options), files)
     except (ValueError, SegmenterError) as error:
         raise CommandError(str(error)) from error
-    _draw_all(options, scene, shot, gazes, look, folder, console)
-    if rate is not None:
-        path = options.output_dir / "video.mp4"
-        write_video(path, [folder.path(name) for name in shot.names], rate)
-        console.print(str(path), soft_wrap=True)
+    try:
+        _draw_all(options, scene, shot, gazes, look, folder, console)
+        if rate is not None:
+            path = options.output_dir / VIDEO
+            write_video(path, [folder.path(name) for name in shot.names], rate)
+            console.print(str(path), soft_wrap=True, highlight=False, markup=False)
+    except MemoryError as error:
+        width, height = max(((c.width, c.height) for c in shot.cameras), key=lambda size: size[0] * size[1])
+        raise CommandError(f"{width}x{height} px do not fit into memory; give a smaller --size.") from error
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+    except KeyboardInterrupt:
+        console.print("Stopped. The same command draws what is missing.")
+        raise
 
 
 def _check(options: RenderOptions) -> Amount | None:
     """Refuse what makes no sense for any scene, before one is loaded; the budget."""
     if options.level is not None:
         LevelCut(options.level)
-    if options.size is not None and min(options.size) < 1:
-        raise ValueError(f"size is {options.size[0]}x{options.size[1]}; both must be at least 1 px.")
-    if options.fps is not None and not 0 < options.fps <= 1000:
-        raise ValueError(f"fps is {options.fps:g}; give frames per second above 0, up to 1000.")
+    if options.size is not None:
+        check_size(*options.size)
+    if options.fps is not None:
+        check_rate(options.fps)
+    _check_pairs(options)
     if options.gaze is not None:
         Foveation((0.5, 0.5), options.gaze_sigma, options.gaze_radius)
         if options.gaze_scale is not None:
             check_times(options.gaze_scale)
         if not Path(options.gaze).is_file():
             gaze_points(options.gaze, 1)
-    elif options.gaze_scale is not None:
-        raise ValueError(
-            "--gaze-scale says how small the picture is away from a gaze; give --gaze, too, or leave it out."
-        )
+    if options.focus_outside < 0:
+        raise ValueError(f"--focus-outside is {options.focus_outside}; give 0 (the object alone) or a level.")
     if options.filter != "none":
         find_filter(options.filter)
     return None if options.budget is None else parse_amount(options.budget)
+
+
+def _check_pairs(options: RenderOptions) -> None:
+    """Refuse what would do nothing without another option."""
+    pairs = {"gaze": ("gaze_scale", "gaze_sigma", "gaze_radius"), "focus": ("focus_outside", "segmenter_weights")}
+    for needed, names in pairs.items():
+        for name in names if getattr(options, needed) is None else ():
+            if getattr(options, name) != getattr(RenderOptions, name):
+                option = f"--{name.replace('_', '-')}"
+                raise ValueError(f"{option} does nothing without --{needed}; give --{needed}, too, or leave it out.")
+
+
+def _check_level(options: RenderOptions, scene: Scene) -> None:
+    levels = int(scene.gaussians.level.max()) if len(scene.gaussians) else 0
+    if options.level is None or options.level <= levels:
+        return
+    if scene.gaussians.decay is not None:
+        raise ValueError(f"--level {options.level:g}: this scene has no levels but a decay; use --detail.")
+    has = "one level" if levels == 1 else f"{levels} levels"
+    raise ValueError(f"--level {options.level:g}: this scene has {has}; give at most {levels}, or leave it out.")
 
 
 def _gazes(options: RenderOptions, frames: int) -> list[Point | None]:
@@ -92,10 +127,16 @@ def _rate(options: RenderOptions, shot: Shot) -> float | None:
     rate = options.fps if options.fps is not None else (shot.fps or 24.0)
     if options.video == "never" or (options.video == "paths" and shot.fps is None):
         return None
+    check_rate(rate)
     sizes = sorted({(camera.width, camera.height) for camera in shot.cameras})
     if len(sizes) > 1:
         found = ", ".join(f"{w}x{h}" for w, h in sizes[:3])
         raise ValueError(f"a video has one size, and the views have {len(sizes)} ({found} px ...); give --size.")
+    if max(sizes[0]) > LONGEST:
+        raise ValueError(
+            f"{sizes[0][0]}x{sizes[0][1]} px are too many for a video, whose sides have at most {LONGEST:,}; give a "
+            "smaller --size, or --video never."
+        )
     return rate
 
 
@@ -104,6 +145,10 @@ def _settings(options: RenderOptions) -> dict[str, Any]:
     left_out = ("output_dir", "video", "fps")
     chosen = {f.name: getattr(options, f.name) for f in fields(options) if f.name not in left_out}
     files = [options.load_config, options.ply, options.path, filter_file(options.filter)]
+    if options.load_config is not None:
+        files += sorted((options.load_config.parent / "nerfstudio_models").glob("step-*.ckpt"))[-1:]
+    if options.focus is not None and Path(options.focus).is_dir():
+        files += sorted(Path(options.focus).glob("*.png"))
     chosen["files"] = [p.stat().st_mtime for p in files if p is not None and p.is_file()]
     if options.gaze is not None and Path(options.gaze).is_file():
         chosen["gaze"] = Path(options.gaze).read_text(encoding="utf-8")
@@ -220,11 +265,12 @@ def _draw_all(
         milliseconds = 1e3 * (time.perf_counter() - start)
         record = FrameRecord(shot.names[i], int(rendering.info["drawn"]), round(milliseconds, 2), gaze)
         folder.add(record, rendering.features.clamp(0, 1).cpu().numpy())
-    _report(folder, shot, len(scene.gaussians), console)
+    _report(folder, shot, len(scene.gaussians), options.path is not None, console)
 
 
-def _report(folder: FrameFolder, shot: Shot, total: int, console: "Console") -> None:
+def _report(folder: FrameFolder, shot: Shot, total: int, along_path: bool, console: "Console") -> None:
     """A line per frame, or of many frames the range."""
+    from rich.markup import escape
     from rich.table import Table
 
     records = [folder.records[name] for name in shot.names]
@@ -235,10 +281,11 @@ def _report(folder: FrameFolder, shot: Shot, total: int, console: "Console") -> 
         table.add_column(heading, justify="right")
     if len(records) <= 20:
         for record in records:
-            table.add_row(record.name, f"{record.drawn:,}", f"{record.milliseconds:.1f}")
+            table.add_row(escape(record.name), f"{record.drawn:,}", f"{record.milliseconds:.1f}")
     for name, at in (("least", 0), ("median", len(records) // 2), ("most", -1)):
         table.add_row(name, f"{counts[at]:,}", f"{times[at]:.1f}")
     console.print(table)
     if empty:
-        names = ", ".join(empty[:5]) + (" ..." if len(empty) > 5 else "")
-        console.print(f"[yellow]{len(empty)} frames draw no Gaussian: {names}. The path may have left the scene.")
+        names = escape(", ".join(empty[:5])) + (" ..." if len(empty) > 5 else "")
+        left = " The path may have left the scene." if along_path else ""
+        console.print(f"[yellow]{len(empty)} frames draw no Gaussian: {names}.{left}")

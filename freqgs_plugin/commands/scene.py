@@ -14,6 +14,9 @@ from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
 from freqgs_plugin.reports.bench.trained import load, views_of_split
 from freqgs_plugin.types import Camera, Gaussians
 
+MOST_PIXELS = 1 << 28
+"""of a picture: 16384 x 16384, for which about 10 GB of memory are taken"""
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -97,9 +100,22 @@ def shots(scene: Scene, path: Path | None, split: Literal["test", "train"], size
         if not views:
             raise ValueError(f"the run has no views in the split '{split}'; choose the other one, or give --path.")
         shot = Shot([view.camera for view in views], [Path(view.name).stem for view in views])
+    for camera in shot.cameras[: 0 if size is not None else None]:
+        check_size(camera.width, camera.height)
     device = scene.gaussians.means.device
     cameras = [replace(c, viewmat=c.viewmat.to(device), K=c.K.to(device)) for c in shot.cameras]
     return replace(shot, cameras=cameras if size is None else [resized(c, *size) for c in cameras])
+
+
+def check_size(width: int, height: int) -> None:
+    """Refuse, with a ValueError, pictures without a pixel, and with so many that no machine draws them."""
+    if min(width, height) < 1:
+        raise ValueError(f"size is {width}x{height}; both must be at least 1 px.")
+    if width * height > MOST_PIXELS:
+        raise ValueError(
+            f"size is {width}x{height}, {width * height / 1e6:,.0f} million pixels; give a --size of at most "
+            f"{MOST_PIXELS / 1e6:,.0f} million."
+        )
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from freqgs_plugin.commands.options import CommandError
 from freqgs_plugin.commands.trim_options import TrimOptions
 from freqgs_plugin.reports.bench.page import check_places, fill
+from freqgs_plugin.reports.bench.runner import check_folder
 from freqgs_plugin.reports.bench.trained import load, quiet
 from freqgs_plugin.reports.tables import finite_json
 from freqgs_plugin.reports.trim.page import markdown, place_name, record_of, remarks, summary, trim_table
@@ -25,6 +26,7 @@ def run_trim(options: TrimOptions, console: "Console") -> None:
     Raises:
         CommandError: options or a run with which that cannot be done.
         OSError: inputs that are not there, or a folder that cannot be written.
+        KeyboardInterrupt: passed on, after a message.
     """
     if not (math.isfinite(options.max_loss_db) and options.max_loss_db >= 0):
         raise CommandError(f"max-loss-db is {options.max_loss_db:g}; give a loss of PSNR in dB, 0 or more.")
@@ -32,21 +34,23 @@ def run_trim(options: TrimOptions, console: "Console") -> None:
         _trim(options, console)
     except ValueError as error:
         raise CommandError(str(error)) from error
+    except KeyboardInterrupt:
+        console.print("Stopped. Nothing was written.")
+        raise
 
 
 def _trim(options: TrimOptions, console: "Console") -> None:
-    from freqgs_plugin.io.init_source import load_checkpoint
+    run = load(options.load_config)
+    # loading keeps quiet what nerfstudio says as it is imported
+    from freqgs_plugin.studio.run_files import latest_checkpoint
     from freqgs_plugin.studio.trimmed import check_place, checkpoint_bytes, write_trimmed
 
     old = options.load_config.resolve().parent
+    checkpoint, _ = latest_checkpoint(old)
     folder = options.output_dir or old.with_name(f"{old.name}-trimmed")
-    checkpoint = _latest(old)
-    if checkpoint is not None:
-        load_checkpoint(checkpoint)
-    run = load(options.load_config)
-    assert checkpoint is not None
     if not options.dry_run:
         check_place(folder.absolute(), run.config.method_name)
+        check_folder(folder.absolute().parent)
     with quiet():
         views = run.num_views("train"), run.num_views("test")
     if not views[0]:
@@ -72,13 +76,7 @@ def _trim(options: TrimOptions, console: "Console") -> None:
         "trim.md": f"# {old.name}, trimmed\n\n{text}",
     }
     config = write_trimmed(run, steps[-1].draft, old, folder.absolute(), more)
-    console.print(f"{config}", soft_wrap=True)
-
-
-def _latest(folder: Path) -> Path | None:
-    """The checkpoint that nerfstudio loads."""
-    found = sorted((folder / "nerfstudio_models").glob("step-*.ckpt"))
-    return found[-1] if found else None
+    console.print(f"{config}", soft_wrap=True, highlight=False, markup=False)
 
 
 def _report(run: Any, steps: list[Step], options: TrimOptions, console: "Console") -> None:

@@ -31,7 +31,7 @@ from freqgs_plugin.types import Camera, Gaussians
 
 TIE = 2e-6
 """cut-offs that differ by a smaller share count as equal: float32 cannot tell on which side of them a scale is"""
-_FEW = 4096
+_FEW = 256
 _FADE = 0.25
 """Gaussians fade in between 1 and at most this much more than 1 times the measure at which they are left out"""
 _WHOLE = 0.75
@@ -275,6 +275,15 @@ def _count_above(a: Float[Tensor, " n"], b: Float[Tensor, " n"], log_scale: floa
     return int(torch.count_nonzero(torch.sub(b, a, alpha=math.exp(2 * log_scale)) > log_scale))
 
 
+def _between(a: Float[Tensor, " n"], b: Float[Tensor, " n"], low: float, high: float) -> Tensor:
+    """Rows whose cut-offs lie above `low` and not above `high`."""
+    if a.device.type == "cpu":
+        from freqgs_plugin.functional import compiled_budget
+
+        return compiled_budget.between(a, b, low, high)
+    return (torch.sub(b, a, alpha=math.exp(2 * low)) > low) & (torch.sub(b, a, alpha=math.exp(2 * high)) <= high)
+
+
 def _two_cutoffs(a: Float[Tensor, " n"], b: Float[Tensor, " n"], count: int, low: float) -> tuple[float, float]:
     """The `count`-th largest ln s* and the next one; all are above `low`, and there are more than `count`.
 
@@ -291,7 +300,7 @@ def _two_cutoffs(a: Float[Tensor, " n"], b: Float[Tensor, " n"], count: int, low
             high, above_high = middle, above
         else:
             break
-    rows = (torch.sub(b, a, alpha=math.exp(2 * low)) > low) & (torch.sub(b, a, alpha=math.exp(2 * high)) <= high)
+    rows = _between(a, b, low, high)
     cutoffs = _solve(a[rows], b[rows]).sort(descending=True).values
     return float(cutoffs[count - above_high - 1]), float(cutoffs[count - above_high])
 

@@ -29,10 +29,14 @@ def _in_view(means, scales, view, intrinsics, width, height, slack, out):
             continue
         u = (view[0, 0] * m0 + view[0, 1] * m1 + view[0, 2] * m2 + view[0, 3]) / z
         v = (view[1, 0] * m0 + view[1, 1] * m1 + view[1, 2] * m2 + view[1, 3]) / z
+        x, y = u * fx + cx, v * fy + cy
+        # a radius is not negative: most of what is in view needs none
+        if 0 < x < width and 0 < y < height:
+            out[i] = True
+            continue
         held_u, held_v = min(max(u, low_u), high_u), min(max(v, low_v), high_v)
         size = np.float64(max(scales[i, 0], scales[i, 1], scales[i, 2])) * focal / z
         radius = math.ceil(RADIUS_SIGMAS * math.sqrt(size * size * (1 + held_u * held_u + held_v * held_v) + slack))
-        x, y = u * fx + cx, v * fy + cy
         out[i] = x + radius > 0 and x - radius < width and y + radius > 0 and y - radius < height
 
 
@@ -53,6 +57,15 @@ def _count_above(a, b, factor, log_scale):
     n = 0
     for i in range(len(a)):
         n += b[i] - a[i] * factor > log_scale
+    return n
+
+
+@njit(error_model="numpy", nogil=True, cache=True)
+def _between(a, b, low_factor, low, high_factor, high, out):
+    n = 0
+    for i in range(len(a)):
+        out[n] = i
+        n += b[i] - a[i] * low_factor > low and b[i] - a[i] * high_factor <= high
     return n
 
 
@@ -85,3 +98,10 @@ def exponents(
 def count_above(a: Tensor, b: Tensor, log_scale: float) -> int:
     """How many have b - a e^(2 log_scale) > log_scale, for float64 tensors on the CPU."""
     return _count_above(a.numpy(), b.numpy(), math.exp(2 * log_scale), log_scale)
+
+
+def between(a: Tensor, b: Tensor, low: float, high: float) -> Tensor:
+    """Rows above `low` and not above `high`, as `count_above` has it."""
+    rows = np.empty(len(a) + 1, dtype=np.int64)
+    n = _between(a.numpy(), b.numpy(), math.exp(2 * low), low, math.exp(2 * high), high, rows)
+    return torch.from_numpy(rows[:n])

@@ -16,6 +16,8 @@ from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.rendering.base import Rasterizer
 from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.model import FreqSplatModel
+from freqgs_plugin.studio.run_files import latest_checkpoint, read_config
+from freqgs_plugin.studio.view_names import view_names
 from freqgs_plugin.types import Camera, Gaussians
 
 
@@ -112,7 +114,14 @@ class Run:
         image = image.float() / 255.0 if image.dtype == torch.uint8 else image
         image = self.model.composite_with_background(image, self.background)
         camera = to_camera(dataset.cameras[index : index + 1].to(self.model.device))
-        return View(Path(dataset.image_filenames[index]).name, camera, image)
+        return View(self._names[dataset.image_filenames[index]], camera, image)
+
+    @cached_property
+    def _names(self) -> dict[Path, str]:
+        """File of a photograph -> name of the view."""
+        manager = self._pipeline.datamanager
+        files = [*manager.train_dataset.image_filenames, *manager.eval_dataset.image_filenames]
+        return dict(zip(files, view_names(files), strict=True))
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint holds as `pipeline`."""
@@ -131,21 +140,20 @@ def load_run(config_path: Path) -> Run:
 
     Raises:
         FileNotFoundError: there is no such file, or no checkpoint beside it.
-        ValueError: the run is of another method.
+        ValueError: the run is of another method, or one of its files is damaged.
     """
     config_path = Path(config_path)
-    if not config_path.is_file():
-        raise FileNotFoundError(f"{config_path} is no file; name the config.yml of a trained run.")
-    checkpoints = config_path.parent / "nerfstudio_models"
-    if not any(checkpoints.glob("step-*.ckpt")):
-        raise FileNotFoundError(f"{checkpoints} holds no step-*.ckpt; the run has not saved a checkpoint yet.")
+    read_config(config_path)
+    checkpoint, latest = latest_checkpoint(config_path.parent)
 
     def found_here(config: Any) -> Any:
         # a run's config names its folder as ns-train was told, which may be relative to where that was started
         experiment, timestamp = config_path.resolve().parents[2], config_path.resolve().parent
         config.output_dir, config.experiment_name = experiment.parent, experiment.name
         config.timestamp = timestamp.name
-        if config.get_checkpoint_dir() != checkpoints.resolve():
+        # else nerfstudio takes every file in the folder for a checkpoint
+        config.load_step = latest
+        if config.get_checkpoint_dir() != checkpoint.resolve().parent:
             raise FileNotFoundError(
                 f"{config_path} is of method {config.method_name}, and no folder above it is called so. "
                 f"Put it where ns-train did: EXPERIMENT/{config.method_name}/TIME/config.yml."

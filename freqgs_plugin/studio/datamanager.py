@@ -1,6 +1,7 @@
 """nerfstudio's full-image datamanager, after a look at the scene: what is wrong is said before training starts."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,10 +11,14 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from freqgs_plugin.io.check_images import SceneError, some
 from freqgs_plugin.io.check_scene import SceneSummary, check_colmap_scene, find_model
 from freqgs_plugin.studio.cameras import to_camera
+from freqgs_plugin.studio.disk_views import DiskViews
+from freqgs_plugin.studio.image_cache import EvalPairs, Where, choose_place, scene_folder
+from freqgs_plugin.studio.view_names import view_names
 from freqgs_plugin.types import Camera
 
 NAMED_CAMERAS = "named_cameras"
@@ -22,10 +27,19 @@ NAMED_CAMERAS = "named_cameras"
 
 @dataclass
 class SceneDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's fields; images are cached as 8 bit."""
+    """nerfstudio's fields, and where photographs are kept."""
 
     _target: type = field(default_factory=lambda: SceneDatamanager)
     cache_images_type: Literal["uint8", "float32"] = "uint8"
+    """of a cached photograph: 3 or 12 bytes per pixel (nerfstudio's default is float32)"""
+    cache_images_where: Where = "auto"
+    """where photographs are kept at the size used: memory, disk (written once, mapped into memory when looked at), or
+    auto: memory if all of them take at most cache_images_share of what is available, else disk (ours)"""
+    cache_images_share: float = 0.5
+    """share of the available memory up to which auto keeps photographs there, in (0, 1] (ours)"""
+    cache_images_dir: Path | None = None
+    """where disk puts a folder for each scene; None: freqgs/images in the user's cache, $XDG_CACHE_HOME or ~/.cache
+    (ours)"""
 
 
 class SceneDatamanager(FullImageDatamanager):
@@ -43,8 +57,12 @@ class SceneDatamanager(FullImageDatamanager):
         **kwargs: Any,
     ):
         self.held_back: set[int] = set()
+        if not 0 < config.cache_images_share <= 1:
+            raise ValueError(f"cache-images-share is {config.cache_images_share}; it is a share of memory in (0, 1].")
         parser = config.dataparser
         data = Path(config.data if config.data is not None else parser.data)
+        if test_mode != "val" and not data.exists():
+            raise SceneError(_moved(data))
         if isinstance(parser, ColmapDataParserConfig):
             _look_at_colmap(parser, data, thorough=test_mode == "val")
         elif isinstance(parser, NerfstudioDataParserConfig):
@@ -55,13 +73,34 @@ class SceneDatamanager(FullImageDatamanager):
         self.train_dataset.metadata[NAMED_CAMERAS] = self.named_cameras
 
     def named_cameras(self) -> tuple[list[str], list[Camera]]:
-        """File names and cameras of the views trained on, and then of those held out, on the CPU."""
-        names, cameras = [], []
+        """Names and cameras of the views trained on, and then of those held out, on the CPU."""
+        files, cameras = [], []
         # looked at first: nerfstudio undistorts images and cameras as it reads them
         for _, dataset in ((self.cached_train, self.train_dataset), (self.cached_eval, self.eval_dataset)):
-            names += [Path(file).name for file in dataset.image_filenames]
+            files += dataset.image_filenames
             cameras += [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
-        return names, cameras
+        return view_names(files), cameras
+
+    @cached_property
+    def images_on_disk(self) -> bool:
+        """Whether photographs are kept on disk: decided, and said, when the first of them is needed."""
+        return choose_place(self.config, (self.train_dataset, self.eval_dataset), self.device) == "disk"
+
+    def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> Any:
+        if not self.images_on_disk:
+            return super()._load_images(split, cache_images_device)
+        dataset = self.train_dataset if split == "train" else self.eval_dataset
+        views = DiskViews(dataset, self.config.cache_images_type, scene_folder(self.config))
+        cameras = self.train_dataset.cameras
+        self.train_cameras = cameras.to(self.device) if cache_images_device == "gpu" else cameras
+        return views
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> Any:
+        """Cameras and images held out; from disk one by one, not all on the device at once."""
+        if not self.images_on_disk:
+            return super().fixed_indices_eval_dataloader
+        return EvalPairs(self.cached_eval, self.eval_dataset.cameras, self.device)
 
     def sample_train_cameras(self) -> list[int]:
         """nerfstudio's order of training views, without those held back."""
@@ -73,11 +112,25 @@ class SceneDatamanager(FullImageDatamanager):
         self.train_unseen_cameras = self.sample_train_cameras()
 
 
+def _moved(data: Path) -> str:
+    """Of a run, which knows its scene by its folder alone."""
+    remedy = (
+        "Move it back, or name its new place in the run's config.yml: there, put one line `- /NEW/FOLDER` in place of "
+        "the lines that begin with `- `, one for each part of the old path, below the first `data:` that holds it."
+    )
+    if data.is_absolute():
+        return f"the scene's folder {data} is not there. {remedy}"
+    return (
+        f"the scene's folder {data} is not in {Path.cwd()}: the run names it from where ns-train was started. Go "
+        f"there, or {remedy[0].lower()}{remedy[1:]}"
+    )
+
+
 def _look_at_colmap(parser: ColmapDataParserConfig, data: Path, thorough: bool) -> None:
     """Point the parser at the model that is there, and check the scene."""
     found = find_model(data)
     if found is not None and find_model(data, (str(parser.colmap_path),)) is None:
-        CONSOLE.log(f"No COLMAP model in {data / parser.colmap_path}; using the one in {data / found}.")
+        CONSOLE.log(escape(f"No COLMAP model in {data / parser.colmap_path}; using the one in {data / found}."))
         parser.colmap_path = Path(found)
     if not thorough:
         return
@@ -104,7 +157,7 @@ def _report(summary: SceneSummary) -> None:
         f"{summary.num_points:,} points."
     )
     for warning in summary.warnings:
-        CONSOLE.log(f"[yellow]{warning}")
+        CONSOLE.log(f"[yellow]{escape(warning)}")
 
 
 def _look_at_transforms(data: Path) -> None:

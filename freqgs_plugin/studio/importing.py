@@ -1,9 +1,7 @@
 """Gaussians of a file as a trained run: config.yml, the frame and a checkpoint."""
 
 import copy
-import shutil
 import statistics
-import tempfile
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
@@ -21,6 +19,7 @@ from freqgs_plugin.io.exported import Exported
 from freqgs_plugin.io.init_source import TRANSFORMS, frame_of
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.studio.cameras import to_camera
+from freqgs_plugin.studio.run_files import in_one_piece, save_checkpoint
 
 
 @dataclass(frozen=True)
@@ -53,15 +52,12 @@ def write_run(exported: Exported, settings: RunSettings) -> Path:
     state = _state(pipeline, raw, exported, settings.method)
     pipeline.load_pipeline(state, 0)
     base = config.get_base_dir()
-    base.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".import-", dir=base.parent, ignore_cleanup_errors=True) as name:
-        folder = Path(name) / "run"
+    with in_one_piece(base) as folder:
         (folder / config.relative_model_dir).mkdir(parents=True)
         (folder / "config.yml").write_text(yaml.dump(config), encoding="utf-8")
         outputs.save_dataparser_transform(folder / TRANSFORMS)
         checkpoint = {"step": 0, "pipeline": state, "optimizers": {}, "schedulers": {}, "scalers": {}}
-        torch.save(checkpoint, folder / config.relative_model_dir / "step-000000000.ckpt")
-        shutil.move(folder, base)
+        save_checkpoint(checkpoint, folder / config.relative_model_dir / "step-000000000.ckpt", base)
     return base / "config.yml"
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from freqgs_plugin.functional.attenuation import Attenuation, LevelCut, Product
 from freqgs_plugin.functional.budget import LevelBudget, in_view
 from freqgs_plugin.functional.pyramid import max_levels, reduce
-from freqgs_plugin.rendering.render import render_prefixes
+from freqgs_plugin.rendering.render import render_prefixes, rendered_weight
 from freqgs_plugin.studio.config import FreqSplatModelConfig
 from freqgs_plugin.studio.controls import band_of, level_cut, lod_slider
 from freqgs_plugin.studio.level_gain import LevelGain, view_image
@@ -26,6 +26,7 @@ from freqgs_plugin.training.baking import signed_refusal
 from freqgs_plugin.training.choose_levels import MOST_LEVELS, choose_levels
 from freqgs_plugin.training.densify import Growth, LevelStrategy, add_level
 from freqgs_plugin.training.objective import pyramid_objective
+from freqgs_plugin.training.promote import promote, surplus
 from freqgs_plugin.training.schedule import Schedule, scaled
 from freqgs_plugin.types import Camera, Gaussians, Rendering
 
@@ -88,6 +89,9 @@ class LapSplatModelConfig(FreqSplatModelConfig):
     """whose opacities are reset: all levels' (the paper) or only the newest's (ours)"""
     restart_schedulers: bool = True
     """learning rate schedules begin anew with each level, as optimizers do (the paper)"""
+    base_share: float = 1.0
+    """share of all Gaussians that level 1 may have in the last stage: what its own small pictures need least moves to
+    level 2, with its colour; 1: any (ours)"""
     new_level_opacity: float | None = None
     """bound on the opacity of a new level's duplicates; None: as their originals (the paper)"""
 
@@ -106,6 +110,8 @@ class LapSplatModel(FreqSplatModel):
         for name in ("auto_psnr", "auto_share", "least_level_gain"):
             if not 0 <= getattr(config, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(config, name)}; it must be a finite number >= 0.")
+        if not 0 < config.base_share <= 1:
+            raise ValueError(f"base_share is {config.base_share}; it must be over 0 and at most 1 (1: no bound).")
         if config.level_interval < 1:
             raise ValueError(f"level_interval is {config.level_interval} steps; it must be at least 1.")
 
@@ -153,6 +159,9 @@ class LapSplatModel(FreqSplatModel):
             assert attributes.pipeline is not None
             self._gain.hold_back(attributes.pipeline.datamanager)
         return callbacks
+
+    def level_choice(self) -> dict[str, Any]:
+        return dict(self._level_choice)
 
     def _make_schedule(self) -> Schedule:
         config, s = self.config, self._scale
@@ -215,6 +224,27 @@ class LapSplatModel(FreqSplatModel):
             f"Step {self.step}: level {stage} of {self._num_levels} begins with {added:,} Gaussians, "
             f"at 1/{2 ** self._halvings()} size."
         )
+
+    def _remove_unneeded(self, step: int) -> dict[str, int]:
+        done = super()._remove_unneeded(step)
+        if 1 < self._stage == self._num_levels and self.schedule.drops_unneeded(step):
+            moved = self._bound_base()
+            done.update({"moved to level 2": moved} if moved else {})
+        return done
+
+    def _bound_base(self) -> int:
+        """Move what the base's pictures, at their own size, need least to level 2. Returns how many."""
+        share, level = self.config.base_share, self.level
+        if int((level == 1).sum()) <= share * len(level):  # pyright: ignore
+            return 0
+        gaussians, base = self.gaussians(), LevelCut(1)
+        weight = gaussians.means.new_zeros(len(gaussians))
+        for camera in self._train_cameras(self._num_levels - 1):
+            weight += rendered_weight(
+                gaussians, camera, 1, base, rasterizer=self.rasterizer(), antialiased=self.antialiased
+            )
+        rows = surplus(level, weight, share)  # pyright: ignore
+        return promote(self.gauss_params, self._optimizers.optimizers, level, rows, self._signed())  # pyright: ignore
 
     def _gradient_weights(self) -> Float[Tensor, " n"]:
         config = self.config

@@ -95,6 +95,11 @@ class FreqSplatModel(SplatViews):
         dropped = self._drop_unneeded() if self.schedule.drops_unneeded(step) else 0
         return {"dropped (hardly seen)": dropped} if dropped else {}
 
+    def level_choice(self) -> dict[str, Any]:
+        """How the number of levels was chosen: `choose_levels.LevelChoice.state`, and `stopped` where no level gained
+        enough; empty where it was given."""
+        return {}
+
     def _census(self) -> str:
         """What is logged with the number of Gaussians."""
         return ""

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 import yaml
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from freqgs_plugin.io.init_source import InitSource, frame_of, read_init_source
 from freqgs_plugin.io.ply import SplatFileError
@@ -75,9 +76,9 @@ def start_from(model: Any, path: Path, declared_frame: str, datamanager: Any) ->
     source = read_start(path)
     outputs = datamanager.train_dataparser_outputs
     scene = frame_of(outputs.dataparser_transform, outputs.dataparser_scale)
-    CONSOLE.log(f"Starting from {source.summary}")
+    CONSOLE.log(escape(f"Starting from {source.summary}"))
     for doubt in _doubts(source, model.config):
-        CONSOLE.log(f"[yellow]{doubt}")
+        CONSOLE.log(f"[yellow]{escape(doubt)}")
     model.take_over(source.in_frame(scene, declared_frame))
     shown = _shown(model, datamanager)
     CONSOLE.log(f"The start shows training views at {shown:.1f} dB.")

@@ -2,11 +2,8 @@
 
 import copy
 import io
-import os
 import shutil
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +15,8 @@ from freqgs_plugin.apps.trimming import Draft, without_empty_levels
 from freqgs_plugin.io.init_source import TRANSFORMS
 from freqgs_plugin.io.packed import pack, packing_order
 from freqgs_plugin.studio.checkpoint import Run
+from freqgs_plugin.studio.run_files import CHECKPOINTS, in_one_piece, save_checkpoint
 
-_FOLDER = "nerfstudio_models"
 _MODEL = "_model."
 _STATE = f"{_MODEL}_extra_state"
 
@@ -108,12 +105,12 @@ def write_trimmed(run: Run, draft: Draft, old: Path, folder: Path, more: Mapping
     method = run.config.method_name
     check_place(folder, method)
     folder = folder.resolve()
-    with _in_one_piece(folder) as partial:
+    with in_one_piece(folder) as partial:
         (partial / "config.yml").write_text(yaml.dump(_config(run, draft, folder)), encoding="utf-8")
         if (old / TRANSFORMS).is_file():
             shutil.copy2(old / TRANSFORMS, partial / TRANSFORMS)
-        (partial / _FOLDER).mkdir()
-        _save(checkpoint_of(run, draft), partial / _FOLDER / f"step-{run.step:09d}.ckpt")
+        (partial / CHECKPOINTS).mkdir()
+        save_checkpoint(checkpoint_of(run, draft), partial / CHECKPOINTS / f"step-{run.step:09d}.ckpt", folder)
         for name, text in more.items():
             (partial / name).write_text(text, encoding="utf-8")
     return folder / "config.yml"
@@ -130,34 +127,6 @@ def _config(run: Run, draft: Draft, folder: Path) -> Any:
     if hasattr(model, "num_levels"):
         model.num_levels = len(without_empty_levels(draft.gaussians.level)[1])
     return config
-
-
-def _save(content: dict[str, Any], path: Path) -> None:
-    try:
-        torch.save(content, path)
-    except RuntimeError as error:
-        # what torch says of a full disk does not name it
-        free = shutil.disk_usage(path.parent).free
-        reason = str(error).splitlines()[0]
-        raise OSError(
-            f"{path.name} cannot be written to {path.parent.parent.parent} ({reason}); {free / 1e6:,.0f} MB are free "
-            "there. Make room, or name another --output-dir."
-        ) from error
-
-
-@contextmanager
-def _in_one_piece(folder: Path) -> Iterator[Path]:
-    """A folder beside `folder`, which becomes it at the end; removed where that fails."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
-        partial.chmod(0o755)
-        yield partial
-        if folder.exists():
-            raise FileExistsError(f"{folder} has appeared meanwhile; name another --output-dir, or remove it.")
-        os.rename(partial, folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _on_cpu(value: Any) -> Any:

@@ -44,6 +44,12 @@ class LevelChoice:
         bands = f"mean square of each Laplacian band, needed {self.bound:.2e}: {told}" if told else "no band to measure"
         return f"{self.levels} level{'s' if self.levels > 1 else ''} ({limit}). {bands}."
 
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> "LevelChoice":
+        """What `state` was made of; other keys are passed over."""
+        width, height = state["size"]
+        return cls(state["levels"], state["energies"], state["kept"], state["bound"], (width, height))
+
     def state(self) -> dict[str, Any]:
         """For a checkpoint: numbers, lists and text alone."""
         return {

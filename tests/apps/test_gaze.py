@@ -39,6 +39,12 @@ def test_what_cannot_be_read(tmp_path):
         (tmp_path / "bad.txt").write_text(content)
         with pytest.raises(ValueError, match=message):
             gaze_points(str(tmp_path / "bad.txt"), 2)
+    (tmp_path / "bad.txt").write_bytes(b"\xff\xfe")
+    with pytest.raises(ValueError, match=r"bad\.txt is no text"):
+        gaze_points(str(tmp_path / "bad.txt"), 2)
+    (tmp_path / "bad.txt").write_text("x" * 1000)
+    with pytest.raises(ValueError, match=r"x{40}'; it must be"):
+        gaze_points(str(tmp_path / "bad.txt"), 2)
 
 
 @pytest.mark.parametrize("place", [(20, 30), (60, 90), (40, 15)])

@@ -1,10 +1,11 @@
 import dataclasses
+import os
 
 import av
 import numpy as np
 import pytest
 
-from freqgs_plugin.commands.frames import RECORD, FrameFolder, FrameRecord, write_video
+from freqgs_plugin.commands.frames import LONGEST, RECORD, FrameFolder, FrameRecord, check_rate, write_video
 from freqgs_plugin.io.images import read_image, write_image
 
 
@@ -28,6 +29,31 @@ def test_frames_of_other_settings_stay(tmp_path):
     with pytest.raises(FileExistsError, match="other settings"):
         FrameFolder(tmp_path, {"level": 2.0})
     assert (read_image(tmp_path / "a.png") == before).all()
+
+
+def test_pictures_that_are_no_frames_stay(tmp_path):
+    """As in the folder of the photographs, which are called like the views."""
+    write_image(tmp_path / "a.png", picture())
+    before = (tmp_path / "a.png").read_bytes()
+    with pytest.raises(FileExistsError, match=r"a\.png is there already, and no frames\.json says"):
+        FrameFolder(tmp_path, {}, ["b.png", "a.png"])
+    assert (tmp_path / "a.png").read_bytes() == before and not (tmp_path / RECORD).exists()
+    FrameFolder(tmp_path, {}, ["b.png"])
+
+
+def test_a_frame_is_recorded_before_it_is_there(tmp_path, monkeypatch):
+    """Else a second start after a stop between the two would take it for a picture that is no frame."""
+    folder = FrameFolder(tmp_path, {}, ["a.png"])
+    monkeypatch.setattr("freqgs_plugin.commands.frames.write_image", stop)
+    with pytest.raises(KeyboardInterrupt):
+        folder.add(FrameRecord("a", 10, 1.5), picture())
+    assert [path.name for path in tmp_path.iterdir()] == [RECORD]
+    assert FrameFolder(tmp_path, {}, ["a.png"]).records == {}
+
+
+def stop(path, image):
+    path.write_bytes(b"half")
+    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"frames": [{"name": "a"}]}', '{"frames": 3}'])
@@ -75,6 +101,26 @@ def test_a_video_has_one_size(tmp_path):
     assert not (tmp_path / "v.mp4").exists()
     with pytest.raises(ValueError, match="no frames"):
         write_video(tmp_path / "v.mp4", [], 24)
+
+
+def test_a_video_that_fails_leaves_nothing(tmp_path, monkeypatch):
+    write_image(tmp_path / "a.png", picture())
+    monkeypatch.setattr(os, "replace", lambda *paths: stop(tmp_path / ".other", None))
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "v.mp4", [tmp_path / "a.png"], 24)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".other", "a.png"]
+
+
+def test_the_longest_side_of_a_video(tmp_path):
+    write_image(tmp_path / "a.png", np.zeros((16, LONGEST, 3), np.uint8))
+    write_video(tmp_path / "v.mp4", [tmp_path / "a.png"], 24)
+    assert (tmp_path / "v.mp4").stat().st_size > 0
+
+
+@pytest.mark.parametrize("fps", [0, -1, 1e-4, 1e308, float("nan"), float("inf")])
+def test_a_rate_that_no_video_has(fps):
+    with pytest.raises(ValueError, match=r"fps is .* from 0\.01 to 1000"):
+        check_rate(fps)
 
 
 def test_records_are_plain():

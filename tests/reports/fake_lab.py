@@ -14,8 +14,6 @@ from freqgs_plugin.reports.experiments.progress import Silent
 from freqgs_plugin.reports.experiments.store import Store
 from freqgs_plugin.reports.experiments.training import PLAIN, ExperimentScene
 
-CONFIG = SimpleNamespace(logging=SimpleNamespace(max_buffer_size=20))
-"""the part of nerfstudio's that is asked for"""
 SCENE = ExperimentScene("room", Path("room"), "what is in room")
 
 
@@ -28,7 +26,7 @@ def decaying_run(decay=2.0, n=60, views=2):
         run.gaussians = replace(run.gaussians, decay=decay * spread)
     run.scene_distance = None if decay is None else 2.5
     held_out = fake_views(views)
-    return SimpleNamespace(**vars(run), config=CONFIG, cameras=lambda split: held_out)
+    return SimpleNamespace(**vars(run), cameras=lambda split: held_out)
 
 
 def levels_run(n=60, views=2):
@@ -36,7 +34,7 @@ def levels_run(n=60, views=2):
     run = fake_run(levels=3, n=n)
     run.rasterizer = get_rasterizer("numba", "cpu")
     held_out = fake_views(views)
-    return SimpleNamespace(**vars(run), scene_distance=None, config=CONFIG, cameras=lambda split: held_out)
+    return SimpleNamespace(**vars(run), scene_distance=None, cameras=lambda split: held_out)
 
 
 class FakeTools:
@@ -69,7 +67,7 @@ class FakeTools:
     def defaults(self, method):
         ours = {"largest_scale": 5.0, "use_decay": True, "weigh_scales": True, "reg_weight": 1.0, "reg_gradient": "ste"}
         levels = {"dft_weight": 0.001, "lower_level_weight": 0.1, "signed_residuals": True}
-        levels |= {"level_interval": 2500, "coarse_growth_factor": 1.8}
+        levels |= {"num_levels": 3, "base_share": 1.0, "level_interval": 2500, "coarse_growth_factor": 1.8}
         more = ours if method.startswith("clodsplat") else {**PLAIN, **levels}
         fields = {"seed": 42, "max_gaussians": 0, **more}
         return {name: repr(value) for name, value in {**fields, **self.changed}.items()}

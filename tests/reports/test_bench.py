@@ -39,7 +39,7 @@ def quiet():
 def table():
     rows = [{"x": 1.5, "timing": Timing(2.0, 1.0, 3.0, 5)}]
     columns = [("x", lambda row: number(row["x"])), ("time", lambda row: milliseconds(row["timing"]))]
-    return BenchTable("one", "A | title", rows, columns, "A note.")
+    return BenchTable("one", "A | [/title]", rows, columns, "A note.")
 
 
 def bench(name="made-up", figure=None, steps=1):
@@ -156,7 +156,7 @@ def test_files_hold_circumstances_and_numbers(tmp_path):
     assert report["command"] == "freqgs bench made-up --data SCENE --quick --rounds 3"
     assert report["tables"]["one"]["rows"][0]["x"] == 1.5
     text = (tmp_path / "out" / "made-up.md").read_text()
-    assert "| 1.50 |" in text and "A note." in text and "![A | title](made-up.png)" in text and "--quick" in text
+    assert "| 1.50 |" in text and "A note." in text and "![A | [/title]](made-up.png)" in text and "--quick" in text
     assert (tmp_path / "out" / "made-up.png").read_bytes().startswith(b"\x89PNG")
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["made-up.json", "made-up.md", "made-up.png"]
 
@@ -168,7 +168,7 @@ def test_the_page_is_filled_between_its_comments_again_and_again(tmp_path):
     for _ in range(2):
         run_bench(bench(figure=Figure()), BenchOptions(tmp_path / "out", page), quiet())
         text = page.read_text()
-        assert text.startswith("# Before\n<!-- one -->\n*A | title.*") and text.endswith(
+        assert text.startswith("# Before\n<!-- one -->\n*A | [/title].*") and text.endswith(
             "\n<!-- end of one -->\nafter\n"
         )
         assert "old" not in text and text.count("| 1.50 |") == 1

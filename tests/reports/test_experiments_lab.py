@@ -245,7 +245,9 @@ def test_two_at_once_are_refused(tmp_path):
     run(options_in(tmp_path, page_only=True))
 
 
-@pytest.mark.parametrize("content", ["null", "[]", '{"settings": {}}', '{"settings": {}, "result": null}'])
+@pytest.mark.parametrize(
+    "content", ["null", "[]", '{"settings": {}}', '{"settings": {}, "result": null}', '{"settings": {}, "result": 1}']
+)
 def test_steps_that_hold_no_result_are_named(tmp_path, content):
     store = Store(tmp_path)
     store.path("curve", {}).write_text(content)

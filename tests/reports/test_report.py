@@ -28,6 +28,7 @@ from freqgs_plugin.reports.report.folder import check_output, write_folder
 from freqgs_plugin.reports.report.front import pareto_front
 from freqgs_plugin.reports.report.health import scale_health
 from freqgs_plugin.reports.report.html_page import html_page
+from freqgs_plugin.reports.report.left_out import left_out
 from freqgs_plugin.reports.report.options import ReportError, ReportOptions, command_line
 from freqgs_plugin.reports.report.page import markdown_page
 from freqgs_plugin.reports.report.plots import figures
@@ -328,7 +329,7 @@ def a_record():
         "training": events,
     }
     common = {"method": "lapsplat", "steps": 10, "checkpoint_step": 9, "gaussians": 30, "bytes_each": 100}
-    common |= {"seeds": {"machine": 42, "model": 43}, "rasterizer": "numba", "health": health}
+    common |= {"seeds": {"machine": 42, "model": 43}, "rasterizer": "numba", "health": health, "left_out": []}
     trained = {"step": 5, "seconds": 2.5, "psnr": 20.0, "ssim": 0.5, "rmse": 0.1, "1-ssim": 0.5, "source": "log"}
     levels = [point("1", 1, 20.0, 10, 4, {"psnr": 25.0, "ssim": 0.9, "rmse": 0.05, "1-ssim": 0.1})]
     levels.append(point("1-2", 2, math.inf, 30, 9))
@@ -386,6 +387,28 @@ def test_the_html_page_needs_nothing_else():
     assert len(sources) == 1 + 2 * 3 and all(s.startswith("data:image/png;base64,") for s in sources)
     assert "url(" not in page and "<script" not in page and "//" not in re.sub(r'src="[^"]*"', "", page)
     assert "a &lt;b&gt;" in page and "<b>, " not in page
+
+
+def test_what_is_left_out_is_told_with_what_more_would_buy(tmp_path):
+    assert left_out({}, tmp_path) == []
+    steps = [
+        {"step": "as trained", "done": "", "more": ""},
+        {"step": "decay", "done": "", "more": "none would save 1 MB"},
+    ]
+    (tmp_path / "trim.json").write_text(json.dumps({"summary": "2 MB became 1 MB.", "steps": steps}))
+    choice = {"levels": 2, "energies": [0.5, 1e-9], "kept": [True, False], "bound": 1e-4, "size": [80, 64]}
+    rows = left_out({**choice, "stopped": "level 2 gained 0.1 dB"}, tmp_path)
+    assert [row["what"] for row in rows] == ["levels", "levels", "trimmed", "decay"]
+    assert "2 levels (at most 3" in rows[0]["done"] and "dropped 1/1 size: 1.00e-09" in rows[0]["done"]
+    assert rows[3] == {"what": "decay", "done": "nothing", "more": "none would save 1 MB"}
+    record = a_record()
+    assert len(tables(record, [])) == 4
+    record["runs"][1]["left_out"] = rows
+    (table,) = (t for t in tables(record, []) if t.title == "Left out")
+    assert table.cells()[1] == ["plain", "levels", "level 2 gained 0.1 dB", "-"] and len(table.cells()) == 4
+    (tmp_path / "trim.json").write_text("{")
+    with pytest.raises(ValueError, match=r"trim\.json is damaged"):
+        left_out({}, tmp_path)
 
 
 def test_tables_and_csv_hold_the_same_numbers():

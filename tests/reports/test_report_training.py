@@ -75,6 +75,11 @@ def test_without_evaluations_it_is_said_what_would_make_them(tmp_path):
     assert missing.startswith("was not evaluated") and remedy in missing
     missing = read_log(tmp_path, 20).missing
     assert missing.startswith("has no tensorboard log") and remedy in missing
+    (tmp_path / "events.out.tfevents.0").mkdir()
+    assert read_log(tmp_path, 20).missing == missing
+    (tmp_path / "events.out.tfevents.1").write_bytes(bytes(range(256)) * 8)
+    damaged = read_log(tmp_path, 20).missing
+    assert "nothing can be read" in damaged and remedy in damaged
 
 
 def test_what_was_not_finite_is_told_with_its_first_step():

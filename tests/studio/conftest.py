@@ -92,6 +92,21 @@ def make_config(scene, tmp_path):
 
 
 @pytest.fixture
+def manager(make_config, tmp_path):
+    """`manager(data=None, parser=None, **fields)`: a datamanager whose photographs are on disk."""
+
+    def make(data=None, parser=None, **fields):
+        config = make_config(data=data, parser=parser).pipeline.datamanager
+        ours = {"cache_images_where": "disk", "cache_images_dir": tmp_path / "cache"}
+        for name, value in {**ours, **fields}.items():
+            assert hasattr(config, name), name
+            setattr(config, name, value)
+        return config.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+
+    return make
+
+
+@pytest.fixture
 def make_trainer(make_config, monkeypatch):
     """`make_trainer(load_dir=None, ...)`: nerfstudio's own Trainer, set up and ready to step."""
     # the trainer imports the writer, which cannot be imported before it

@@ -21,7 +21,7 @@ def test_auto_is_chosen_logged_and_stored(make_trainer, said):
     # without auto's budget: the checkpoint says it
     resumed = make_trainer(load_dir=folder, num_levels="auto", auto_share=100.0)
     again = resumed.pipeline.model
-    assert again._num_levels == 3 and again._level_choice == model._level_choice
+    assert again._num_levels == 3 and again.level_choice() == model.level_choice() != {}
     assert again.controls.slider.max == 3.0
     advance(resumed, 1)
     consistent(resumed)
@@ -75,3 +75,33 @@ def test_gains_are_differences_of_psnr(make_trainer):
 def test_impossible_settings(make_trainer, name):
     with pytest.raises(ValueError, match=f"{name} is nan"):
         make_trainer(**{name: float("nan")})
+
+
+def test_the_base_is_bounded_in_the_last_stage(make_trainer):
+    """And the picture of all levels stays the same."""
+    trainer = make_trainer(base_share=0.1)
+    model = trainer.pipeline.model
+    half = len(model.level) // 2
+    with torch.no_grad():
+        model.level[half:] = 3
+        # grey, so that no colour is clamped at 0
+        model.gauss_params["features_dc"][:half] = 0.0
+    model._stage = model._num_levels = 3
+    camera = trainer.pipeline.datamanager.train_dataset.cameras[:1]
+
+    def picture():
+        model.eval()
+        return model.get_outputs_for_camera(camera)["rgb"]
+
+    before = picture()
+    moved = model._bound_base()
+    counts = model.level_counts()
+    assert moved == counts[1] == half - counts[0] and counts[0] == int(0.1 * len(model.level)) > 0
+    assert torch.allclose(picture(), before, atol=1e-4)
+    assert model._bound_base() == 0
+
+
+@pytest.mark.parametrize("share", [0.0, -1.0, 1.5, float("nan")])
+def test_a_share_of_the_base_is_a_share(make_trainer, share):
+    with pytest.raises(ValueError, match="base_share is"):
+        make_trainer(base_share=share)

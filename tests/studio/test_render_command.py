@@ -1,6 +1,8 @@
 """`freqgs render` on trained runs, as a user calls it."""
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,6 +53,9 @@ def test_levels_of_held_out_views(trained, tmp_path, render):
     assert done.code == 0, str(done)
     base = frames(tmp_path / "base")
     assert {r["drawn"] for r in base.values()} == {int((run.gaussians.level == 1).sum())}
+    # what rich takes for markup is part of the name
+    text = render("--load-config", trained, "--output-dir", tmp_path / "[" / "b]", "--video", "always")
+    assert str(tmp_path / "[" / "b]" / "video.mp4") in text
     render("--load-config", trained, "--output-dir", tmp_path / "all")
     for view in run.cameras("test"):
         name = view.name.rsplit(".", 1)[0]
@@ -159,7 +164,16 @@ def test_focus_from_masks_and_from_a_box(trained, tmp_path, render):
         (("--gaze", "0.5,0.5", "--gaze-scale", "0"), "0 times smaller: it must be"),
         (("--gaze", "0.5,0.5", "--gaze-scale", "100000"), "from 1 to 32"),
         (("--gaze-scale", "2"), "give --gaze"),
+        (("--gaze-sigma", "0.2"), "--gaze-sigma does nothing without --gaze"),
+        (("--focus", "nowhere", "--focus-outside", "-3"), "--focus-outside is -3"),
+        (("--load-config", "RUN", "--focus", "text: "), "names nothing"),
+        (("--focus-outside", "0"), "--focus-outside does nothing without --focus"),
+        (("--load-config", "RUN", "--level", "3.5"), "--level 3.5: this scene has 3 levels; give at most 3"),
+        (("--load-config", "FADED", "--level", "2"), "--level 2: this scene has no levels but a decay; use --detail"),
         (("--size", "0", "5"), "at least 1 px"),
+        (("--size", "100000", "100000"), "at most 268 million"),
+        (("--load-config", "RUN", "--video", "always", "--size", "16386", "8"), "or --video never"),
+        (("--load-config", "RUN", "--output-dir", "RUN"), "nothing can be written there"),
         (("--fps", "0"), "fps is 0"),
         (("--filter", "pencil"), "filter is 'pencil'"),
         (("--load-config", "RUN", "--path", "nowhere.json"), "nowhere.json is no file"),
@@ -168,11 +182,11 @@ def test_focus_from_masks_and_from_a_box(trained, tmp_path, render):
         (("--load-config", "RUN", "--focus", "nowhere:1,2"), "the view 'nowhere'"),
         (("--load-config", "RUN", "--focus", "view_001:1,2,3"), "3 numbers"),
         (("--load-config", "RUN", "--focus", "view_001:900,2"), "lies outside of the 80x64 image"),
-        (("--load-config", "RUN", "--focus", "text:ball", "--segmenter-weights", "nowhere"), "nowhere"),
+        (("--load-config", "RUN", "--focus", "text:ball", "--segmenter-weights", "nowhere"), "given with --seg"),
     ],
 )
-def test_what_cannot_be_drawn_is_said(trained, tmp_path, monkeypatch, capsys, arguments, message):
-    given = [str(trained) if a == "RUN" else a for a in arguments]
+def test_what_cannot_be_drawn_is_said(trained, faded, tmp_path, monkeypatch, capsys, arguments, message):
+    given = [str({"RUN": trained, "FADED": faded}.get(a, a)) for a in arguments]
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
         main(["render", *given])
@@ -180,6 +194,35 @@ def test_what_cannot_be_drawn_is_said(trained, tmp_path, monkeypatch, capsys, ar
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
     assert not (tmp_path / "renders").exists()
+
+
+def test_photographs_are_no_frames(trained, scene, tmp_path, capsys):
+    photographs = Path(shutil.copytree(scene / "images", tmp_path / "images"))
+    before = {path: path.read_bytes() for path in photographs.iterdir()}
+    with pytest.raises(SystemExit):
+        main(["render", "--load-config", str(trained), "--output-dir", str(photographs)])
+    assert "view_000.png is there already" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in photographs.iterdir()} == before
+
+
+def test_another_checkpoint_makes_other_frames(trained, tmp_path, capsys, render):
+    own = Path(shutil.copytree(trained.parent, tmp_path / "small" / "lapsplat" / "run"))
+    arguments = ("--load-config", own / "config.yml", "--output-dir", tmp_path / "out")
+    render(*arguments)
+    max((own / "nerfstudio_models").glob("step-*.ckpt")).unlink()
+    with pytest.raises(SystemExit):
+        main(["render", *map(str, arguments)])
+    assert "frames of other settings" in capsys.readouterr().err
+
+
+def test_stopped(trained, tmp_path, monkeypatch, capsys):
+    def stop(*arguments, **more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("freqgs_plugin.commands.render.render", stop)
+    with pytest.raises(SystemExit) as ended:
+        main(["render", "--load-config", str(trained), "--output-dir", str(tmp_path / "out")])
+    assert ended.value.code == 130 and "The same command draws what is missing" in capsys.readouterr().out
 
 
 OWN = """
@@ -207,6 +250,9 @@ def test_a_sheet_of_filters_with_ones_own(trained, tmp_path, monkeypatch, capsys
         for i in range(3)
     ]
     assert min(np.abs(shown.astype(int) - picture).max() for picture in in_sheet) <= 1
+    (tmp_path / "other.py").write_text(OWN)
+    main(["filters", "--load-config", str(trained), "--filters", "own.py:dim", "other.py:dim", "--output", "both.png"])
+    assert read_image(tmp_path / "both.png").shape == sheet.shape
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """`freqgs trim` on trained runs, as a user calls it."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,6 @@ from running import command
 from freqgs_plugin.cli import main
 from freqgs_plugin.io.init_source import read_init_source
 from freqgs_plugin.reports.trim import trimmer
-from freqgs_plugin.studio import trimmed
 from freqgs_plugin.studio.checkpoint import load_run
 from freqgs_plugin.studio.viewing import psnr, show
 
@@ -199,6 +199,8 @@ def test_folders_that_do_not_do(trained, tmp_path, refused):
     assert "is there already" in refused("--load-config", trained, "--output-dir", there)
     page = tmp_path / "page.md"
     page.write_text("nothing")
+    # before anything is measured
+    assert "nothing can be written there" in refused("--load-config", trained, "--output-dir", page / "lapsplat" / "x")
     assert "has no one place" in refused("--load-config", trained, "--dry-run", "--docs", page)
 
 
@@ -211,12 +213,25 @@ def test_damaged_runs(trained, tmp_path, refused):
     assert "has not saved a checkpoint" in refused("--load-config", own / "config.yml")
 
 
-def test_without_photographs(trained, tmp_path, refused):
+def test_without_photographs(trained, scene, tmp_path, refused):
     own = Path(shutil.copytree(trained.parent, tmp_path / "small" / "lapsplat" / "run"))
     config = own / "config.yml"
     # every mention of the data set's folder
-    config.write_text(config.read_text().replace("- scene\n", "- gone\n"))
-    assert "gone" in refused("--load-config", config)
+    text = config.read_text().replace("- scene\n", "- gone\n")
+    config.write_text(text)
+    said = refused("--load-config", config)
+    assert "gone is not there" in said and "put one line `- /NEW/FOLDER` in place of" in said
+    # as it says
+    config.write_text(re.sub(r"(?<=PosixPath\n)(- .*\n)+(?=experiment_name)", f"- {scene}\n", text, count=1))
+    assert load_run(config).num_views("train") == 6
+
+
+def test_photographs_named_from_elsewhere(trained, tmp_path, monkeypatch, refused):
+    own = Path(shutil.copytree(trained.parent, tmp_path / "small" / "lapsplat" / "run"))
+    config = own / "config.yml"
+    config.write_text(re.sub(r"(?<=PosixPath\n)(- .*\n)+(?=experiment_name)", "- scene\n", config.read_text(), count=1))
+    monkeypatch.chdir(tmp_path)
+    assert f"scene is not in {tmp_path}: the run names it from where ns-train" in refused("--load-config", config)
 
 
 @pytest.mark.parametrize("failure", [RuntimeError("PytorchStreamWriter failed writing file"), KeyboardInterrupt()])
@@ -228,11 +243,11 @@ def test_a_full_disk_and_an_interrupt_leave_nothing(trained, tmp_path, monkeypat
             path.write_bytes(b"half")
             raise failure
 
-    monkeypatch.setattr(trimmed.torch, "save", fail)
+    monkeypatch.setattr(torch, "save", fail)
     monkeypatch.setattr(trimmer, "_RETRIES", 0)
     with pytest.raises(SystemExit) as ended:
         main(["trim", "--load-config", str(trained), "--output-dir", str(out)])
-    interrupted = isinstance(failure, KeyboardInterrupt)
+    interrupted, said = isinstance(failure, KeyboardInterrupt), capsys.readouterr()
     assert ended.value.code == (130 if interrupted else 1)
-    assert interrupted or "Make room" in capsys.readouterr().err
+    assert ("Stopped. Nothing was written." in said.out) if interrupted else ("Make room" in said.err)
     assert list(out.parent.iterdir()) == []

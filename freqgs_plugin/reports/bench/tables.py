@@ -41,7 +41,7 @@ class BenchTable:
         from rich.markup import escape
         from rich.table import Table
 
-        table = Table(title=self.title)
+        table = Table(title=escape(self.title))
         for i, (heading, _) in enumerate(self.columns):
             table.add_column(heading, justify="left" if i == 0 else "right")
         for line in self.cells():

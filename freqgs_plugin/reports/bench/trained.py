@@ -33,6 +33,8 @@ def load(config_path: Path) -> Any:
             from freqgs_plugin.studio.checkpoint import load_run
 
             return load_run(config_path)
+    except UnicodeError as error:
+        raise BenchError(f"{config_path} is no text ({error}); name the config.yml of a trained run.") from error
     except (FileNotFoundError, ValueError, AssertionError) as error:
         raise BenchError(str(error)) from error
     except SystemExit as error:

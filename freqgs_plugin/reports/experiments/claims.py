@@ -46,6 +46,7 @@ class Claim:
 PAPER = "lapsplat-paper"
 VARIANTS: Mapping[str, tuple[str, Mapping[str, Value]]] = {
     "lapsplat": ("lapsplat", {}),
+    "small base": ("lapsplat", {"base_share": 0.2}),
     "paper": (PAPER, {}),
     "no DFT": (PAPER, {"dft_weight": 0.0}),
     "no lower levels": (PAPER, {"lower_level_weight": 0.0}),

@@ -39,6 +39,9 @@ class Store:
             record = json.loads(path.read_text(encoding="utf-8"))
             if not isinstance(record, dict) or ("settings" in record and record.get("result") is None):
                 raise ValueError("no finished step")
+            missing = [name for name in ("settings", "seconds", "date", "commit") if name not in record]
+            if missing:
+                raise ValueError(f"without {', '.join(missing)}")
         except ValueError as error:
             raise ExperimentError(f"{path} is damaged ({error}); remove it, and the step is done again") from error
         return record if record.get("settings") == _as_json(settings) else None

@@ -10,6 +10,7 @@ from freqgs_plugin.reports.drawing import HeldOutView
 from freqgs_plugin.reports.experiments.progress import Bars
 from freqgs_plugin.reports.report.drawn import Subset, full_detail, subsets
 from freqgs_plugin.reports.report.health import health
+from freqgs_plugin.reports.report.left_out import left_out
 from freqgs_plugin.reports.report.options import ReportOptions, command_line
 from freqgs_plugin.reports.report.quality import Lpips, lpips_if_there, measure_quality, rmse_of
 from freqgs_plugin.reports.report.runs import ReportedRun, spread
@@ -56,6 +57,7 @@ def measure_report(
                 "full": full,
                 "training": _training(of, full, log),
                 "health": health(of.run, full["clamped"], log),
+                "left_out": left_out(of.run.model.level_choice(), of.config.resolve().parent),
             }
             for of, each, points, full, log in zip(runs, drawn, measured, whole, logs, strict=True)
         ],

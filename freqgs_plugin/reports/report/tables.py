@@ -19,6 +19,8 @@ POINTS_NOTE = (
     "once, before the clock starts; prefixes and s_v are chosen anew in every picture, as a viewer does. \\* : on the "
     "Pareto front of RMSE against ms."
 )
+LEFT_OUT_COLUMNS = (("run", "run"), ("what", "what"), ("left out", "done"), ("not done, and what it would buy", "more"))
+LEFT_OUT_NOTE = "What the scene does not need, as training (levels) and `freqgs trim` found."
 HEALTH_NOTE = (
     "*Clamped*: pixels with a colour outside of [0, 1] before clamping, at full detail; *range*: the extremes there. "
     "*Dead decay*: Gaussians whose sigma has come to the bound. *Near-degenerate*: the shortest standard deviation is "
@@ -39,7 +41,14 @@ def points_of(record: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def tables(record: Mapping[str, Any], front: Sequence[int]) -> list[BenchTable]:
     """All tables; `front` are the numbers of the points on the Pareto front of RMSE against time."""
-    return [_runs(record), _points(record, set(front)), *_training(record), _health(record)]
+    return [_runs(record), _points(record, set(front)), *_training(record), *_left_out(record), _health(record)]
+
+
+def _left_out(record: Mapping[str, Any]) -> list[BenchTable]:
+    """No table where nothing was left out."""
+    rows = [{"run": run["name"], **row} for run in record["runs"] for row in run["left_out"]]
+    columns = [(name, lambda row, key=key: row[key] or NONE) for name, key in LEFT_OUT_COLUMNS]
+    return [BenchTable("report-left-out", "Left out", rows, columns, LEFT_OUT_NOTE)] if rows else []
 
 
 def _runs(record: Mapping[str, Any]) -> BenchTable:

@@ -61,10 +61,12 @@ class TrainingLog:
 def read_log(folder: Path, window: int) -> TrainingLog:
     """The log in a run's folder; `window` is the run's `logging.max_buffer_size`."""
     # named after the second at which they were begun
-    files = sorted(folder.glob(_EVENTS))
+    files = sorted(path for path in folder.glob(_EVENTS) if path.is_file())
     if not files:
         return TrainingLog(missing=f"has no tensorboard log: {_REMEDY}")
     parts = [part for part in (_read(path) for path in files) if part]
+    if not parts:
+        return TrainingLog(missing=f"has a tensorboard log in which nothing can be read; copy it again, or {_REMEDY}")
     return understand(parts, window)
 
 
