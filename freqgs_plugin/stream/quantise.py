@@ -95,10 +95,11 @@ class Coding:
 def coding_from(found: Mapping[str, Any]) -> Coding:
     """`Coding.json`, back."""
     count = found["components"]
-    values = {"kept": range(count), **found}
+    values: dict[str, Any] = {"kept": range(count), **found}
     if not isinstance(values["step"], Sequence):
         values["step"] = [values["step"]] * count
-    return Coding(**{name: tuple(value) if name in _LISTS else value for name, value in values.items()})
+    lists = {name: tuple(values[name]) for name in _LISTS if name in values}
+    return Coding(**{**values, **lists})
 
 
 def coding_of(name: str, values: Float[np.ndarray, "n c"], steps: Steps | None) -> Coding:

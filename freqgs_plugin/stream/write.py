@@ -3,7 +3,6 @@
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -181,9 +180,10 @@ def _cuts(level: Level, cuts: int, base: bool) -> Iterator[_Cut]:
 def _chunks(cuts: Sequence[_Cut], factors: Sequence[float], columns: Columns) -> tuple[list[Chunk], bytes]:
     """All chunks, and their bytes; `factors` are of the first ones."""
     chunks, data = [], b""
-    for (level, part, first, rows), factor in zip_longest(cuts, factors, fillvalue=1.0):
+    for index, (level, part, first, rows) in enumerate(cuts):
         cut = {name: values[first : first + rows] for name, values in columns.items()}
         found = encode_chunk(level.part(part), cut)
+        factor = factors[index] if index < len(factors) else 1.0
         chunks.append(Chunk(level.level, part, first, rows, len(data), len(found), checksum(found), factor))
         data += found
     return chunks, data

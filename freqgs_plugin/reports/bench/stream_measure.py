@@ -55,7 +55,7 @@ class Point:
     complete: float
     """mean PSNR against the run's own pictures, dB"""
     covered: float
-    """of the view with most holes, the share of pixels that are none (`enlarging.without_holes`)"""
+    """of the view with most holes, the share of pixels that are none beside the whole base (`enlarging.without_holes`)"""
     gaussians: int
 
 
@@ -120,8 +120,8 @@ def quality(found: Pictures, expected: Sequence[Tensor]) -> float:
 
 def curve(subject: StreamSubject, stream: Stream) -> list[Point]:
     """After every chunk."""
-    received, whole = Received(stream.manifest), renderings(subject, subject.scene.gaussians)
-    own = shown(whole)
+    received, scene = Received(stream.manifest), subject.scene.gaussians
+    own, base = pictures(subject, scene), renderings(subject, scene.select(scene.level == scene.level.min()))
     photographs = [view.image for view in subject.views]
     points, begin = [], len(stream.manifest.text())
     for chunk in stream.manifest.chunks:
@@ -129,7 +129,7 @@ def curve(subject: StreamSubject, stream: Stream) -> list[Point]:
         received.add(chunk, stream.data[chunk.offset : end])
         drawn = renderings(subject, received.gaussians())
         found = shown(drawn)
-        qualities = quality(found, photographs), quality(found, own), covered(drawn, whole)
+        qualities = quality(found, photographs), quality(found, own), covered(drawn, base)
         points.append(Point(chunk.level, chunk.part, begin + end, *qualities, received.count))
     return points
 
