@@ -159,6 +159,8 @@ class FreqSplatModel(SplatViews):
             )
         if not resumed:
             steps = trainer.config.max_num_iterations
+            if steps < 1:
+                raise ValueError(f"max_num_iterations is {steps}; train for at least 1 step.")
             self._scale = self.config.steps_scale or steps / REFERENCE_STEPS
             self._adapt_to_images(int(cameras.height.min()), int(cameras.width.min()))
             self._begin_run(attributes.pipeline.datamanager)

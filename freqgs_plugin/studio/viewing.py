@@ -88,6 +88,9 @@ class SplatViews(SplatfactoModel):
             raise ValueError(f"rasterize_mode is '{self.config.rasterize_mode}'; choose antialiased or classic.")
         if self.config.dropout is not None and not 0 <= self.config.dropout < 1:
             raise ValueError(f"dropout is {self.config.dropout}; it is a share of the Gaussians, in [0, 1).")
+        scale = self.config.steps_scale
+        if scale is not None and not 0 < scale < float("inf"):
+            raise ValueError(f"steps_scale is {scale}; it must be a finite number > 0, or None: by the run's length.")
 
     def _initial_parameters(self) -> dict[str, torch.nn.Parameter]:
         """The Gaussians at step 0, by parameter group: from the scene's points, or at random."""

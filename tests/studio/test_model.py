@@ -322,6 +322,8 @@ def test_switches(make_trainer, name):
         ({"num_levels": 0}, "num_levels is 0"),
         ({"level_interval": 0}, "level_interval is 0"),
         ({"sh_degree": 7}, "sh_degree is 7"),
+        ({"steps_scale": 0.0}, "steps_scale is 0.0"),
+        ({"steps_scale": float("nan")}, "steps_scale is nan"),
         ({"rasterize_mode": "smooth"}, "rasterize_mode is 'smooth'; choose antialiased or classic"),
     ],
 )

@@ -250,4 +250,4 @@ def test_a_full_disk_and_an_interrupt_leave_nothing(trained, tmp_path, monkeypat
     interrupted, said = isinstance(failure, KeyboardInterrupt), capsys.readouterr()
     assert ended.value.code == (130 if interrupted else 1)
     assert ("Stopped. Nothing was written." in said.out) if interrupted else ("Make room" in said.err)
-    assert list(out.parent.iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
