@@ -3,14 +3,14 @@
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 from freqgs_plugin.stream.errors import StreamError
-from freqgs_plugin.stream.quantise import NAMES, Coding
+from freqgs_plugin.stream.quantise import NAMES, Coding, coding_from
 
-FORMAT, VERSION = "freqgs-stream", 1
+FORMAT, VERSION = "freqgs-stream", 2
 MANIFEST = "manifest.json"
 DATA = re.compile(r"splats-[0-9a-f]{8}\.bin")
 """names of files of chunks: with a checksum, so that no cache takes an old one for a new one"""
@@ -44,6 +44,11 @@ class Chunk:
     offset: int
     bytes: int
     crc32: int
+    enlarge: float = 1.0
+    """factor of all axes while no more than this has arrived: closes the holes of what is missing"""
+
+
+_CHUNK = tuple(field.name for field in fields(Chunk))
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,7 @@ class Manifest:
             "render": {"antialiased": self.antialiased, "background": list(self.background)},
             "decay": None if self.scene_distance is None else {"scene_distance": self.scene_distance},
             "levels": [{**vars(level), "codings": [c.json() for c in level.codings]} for level in self.levels],
-            "chunks": [vars(chunk) for chunk in self.chunks],
+            "chunks": {name: [getattr(chunk, name) for chunk in self.chunks] for name in _CHUNK},
             "views": list(self.views),
         }
         return json.dumps(found, separators=(",", ":"), allow_nan=False)
@@ -109,7 +114,9 @@ def parse_manifest(text: str | bytes, where: str = MANIFEST) -> Manifest:
     except (ValueError, KeyError, TypeError) as error:
         raise StreamError(f"{where} is no manifest of a stream ({error!r}); name the folder of one.") from error
     if kind != FORMAT or version != VERSION:
-        raise StreamError(f"{where} is {kind} of version {version}; this reads {FORMAT} of version {VERSION}.")
+        raise StreamError(
+            f"{where} is {kind} of version {version}; this reads {FORMAT} of version {VERSION}. Write the stream anew."
+        )
     try:
         levels = tuple(
             Level(**{**_only(Level, level), "box": tuple(map(tuple, level["box"])), "codings": _codings(level)})
@@ -124,7 +131,7 @@ def parse_manifest(text: str | bytes, where: str = MANIFEST) -> Manifest:
             background=tuple(map(float, found["render"]["background"])),
             scene_distance=None if found["decay"] is None else float(found["decay"]["scene_distance"]),
             levels=levels,
-            chunks=tuple(Chunk(**_only(Chunk, chunk)) for chunk in found["chunks"]),
+            chunks=tuple(_chunks(found["chunks"])),
             views=tuple(found["views"]),
         )
     except (ValueError, KeyError, TypeError) as error:
@@ -141,11 +148,13 @@ def _only(kind: Any, found: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _codings(level: Mapping[str, Any]) -> tuple[Coding, ...]:
-    lists = ("kept", "low", "step", "centre")
-    return tuple(
-        Coding(**{**coding, **{name: tuple(coding[name]) for name in lists if name in coding}})
-        for coding in level["codings"]
-    )
+    return tuple(coding_from(coding) for coding in level["codings"])
+
+
+def _chunks(found: Mapping[str, Sequence[Any]]) -> Iterator[Chunk]:
+    """From one list per field, which takes half the bytes."""
+    for values in zip(*(found[name] for name in _CHUNK), strict=True):
+        yield Chunk(*values)
 
 
 def _contradiction(manifest: Manifest) -> str | None:
@@ -171,6 +180,8 @@ def _contradiction(manifest: Manifest) -> str | None:
             return f"chunk {index} holds rows {chunk.first} to {chunk.first + chunk.count}, outside of its level"
         if chunk.offset != offset or chunk.bytes < 1:
             return f"chunk {index} begins at byte {chunk.offset} instead of {offset}"
+        if not 1 <= chunk.enlarge < math.inf:
+            return f"chunk {index} enlarges by {chunk.enlarge}"
         offset += chunk.bytes
     if manifest.scene_distance is not None and not 0 < manifest.scene_distance < math.inf:
         return f"scene_distance is {manifest.scene_distance}"

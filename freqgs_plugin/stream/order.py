@@ -1,8 +1,8 @@
 """Which Gaussians of a level are sent first.
 
-Of the base, those that make up most of the picture: their weight in compositing, summed over views and pixels. Of finer
-levels that order is wrong: their large Gaussians correct each other, and some of them alone make the picture worse.
-There those come first that take most of the squared error to the level's own picture, at half of the level's opacity.
+Of the base, those that close most holes (see `covering`). For finer levels that order is wrong: their large Gaussians
+correct each other, and some of them alone make the picture worse. There those come first that take most of the squared
+error to the level's own picture, at half of the level's opacity.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,9 @@ from torch import Tensor
 
 from freqgs_plugin.functional.attenuation import Attenuation
 from freqgs_plugin.rendering.base import Rasterizer
-from freqgs_plugin.rendering.render import render, rendered_weight
+from freqgs_plugin.rendering.render import render
+from freqgs_plugin.stream.covering import covering_order
+from freqgs_plugin.stream.views import judging_views
 from freqgs_plugin.types import Camera, Gaussians
 
 MOST_VIEWS = 32
@@ -39,12 +41,15 @@ def importance(
 ) -> Float[Tensor, " n"]:
     """How early each Gaussian should come among those of its level.
 
-    The time is that of (1 + 2 levels) pictures per camera, about.
+    The time is that of `covering.ROUNDS` small pictures and two more for each further level per camera, about.
     """
     found = torch.zeros_like(gaussians.opacities)
-    stride = max(1, -(-len(cameras) // MOST_VIEWS))
-    for camera in cameras[::stride]:
-        found += _of_view(gaussians, camera, rasterizer, antialiased, attenuation)
+    options = {"rasterizer": rasterizer, "antialiased": antialiased, "attenuation": attenuation}
+    base = torch.where(gaussians.level == gaussians.level.min())[0]
+    order = covering_order(gaussians.select(base), judging_views(cameras, MOST_VIEWS), **options)
+    found[base[order]] = torch.arange(len(order), 0, -1, device=found.device).to(found)
+    for camera in cameras[:: max(1, -(-len(cameras) // MOST_VIEWS))]:
+        found += _finer_levels(gaussians, camera, **options)
     return found
 
 
@@ -57,24 +62,20 @@ def size(gaussians: Gaussians) -> Float[Tensor, " n"]:
     return gaussians.opacities * axes[:, 1] * axes[:, 2]
 
 
-def _of_view(
+def _finer_levels(
     gaussians: Gaussians,
     camera: Camera,
     rasterizer: Rasterizer,
     antialiased: bool,
     attenuation: Attenuation | None,
 ) -> Float[Tensor, " n"]:
+    """0 for the base."""
     found = torch.zeros_like(gaussians.opacities)
-    levels = sorted(set(gaussians.level.tolist()))
-    for level in levels:
+    for level in sorted(set(gaussians.level.tolist()))[1:]:
         rows = torch.where(gaussians.level <= level)[0]
         shown = gaussians.select(rows)
         own = shown.level == level
-        if level == levels[0]:
-            weight = rendered_weight(shown, camera, 1, attenuation, rasterizer=rasterizer, antialiased=antialiased)
-        else:
-            weight = _gain(shown, own, camera, rasterizer, antialiased, attenuation)
-        found[rows[own]] = weight[own]
+        found[rows[own]] = _gain(shown, own, camera, rasterizer, antialiased, attenuation)[own]
     return found
 
 

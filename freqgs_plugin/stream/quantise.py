@@ -7,7 +7,7 @@ bytes.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ _LOGITS = (-6.0, 8.0)
 """beyond, an opacity is not drawn (1/255), or capped (0.999)"""
 _LEAST = 1e-30
 _LARGEST_WORD = 2**16 - 1
+_LISTS = ("kept", "low", "step", "centre")
 _THIRD = math.sqrt(0.5)
 
 
@@ -80,11 +81,25 @@ class Coding:
         return self.size * len(self.kept)
 
     def json(self) -> dict[str, Any]:
-        """Without what has its default."""
+        """Without what has its default; one step where all are the same. `coding_from` reads it."""
         found = {**vars(self), "kept": list(self.kept), "low": list(self.low), "step": list(self.step)}
+        if len(self.kept) == self.components:
+            del found["kept"]
+        if len(set(self.step)) == 1:
+            found["step"] = self.step[0]
         if self.warp != "sinh":
             del found["centre"], found["scale"]
         return found
+
+
+def coding_from(found: Mapping[str, Any]) -> Coding:
+    """`Coding.json`, back."""
+    count = found["components"]
+    values: dict[str, Any] = {"kept": range(count), **found}
+    if not isinstance(values["step"], Sequence):
+        values["step"] = [values["step"]] * count
+    lists = {name: tuple(values[name]) for name in _LISTS if name in values}
+    return Coding(**{**values, **lists})
 
 
 def coding_of(name: str, values: Float[np.ndarray, "n c"], steps: Steps | None) -> Coding:

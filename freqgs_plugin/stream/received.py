@@ -1,5 +1,7 @@
 """What has arrived of a stream, as a scene."""
 
+import math
+
 import numpy as np
 import torch
 
@@ -12,7 +14,10 @@ _WIDTHS = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "features_dc": 3
 
 
 class Received:
-    """Rows of a stream. What has not arrived is not drawn; harmonics that have not are 0."""
+    """Rows of a stream. What has not arrived is not drawn; harmonics that have not are 0.
+
+    While part of the base is missing, the axes are larger (see `enlarging`): by the least factor of what has arrived.
+    """
 
     def __init__(self, manifest: Manifest):
         self.manifest = manifest
@@ -20,6 +25,7 @@ class Received:
         if manifest.scene_distance is not None:
             widths["decay"] = 1
         self._columns = {name: np.zeros((manifest.count, width), np.float32) for name, width in widths.items()}
+        self._enlarge = math.inf
         self._present = np.zeros(manifest.count, bool)
         self._level = np.concatenate([np.full(level.count, level.level) for level in manifest.levels])
 
@@ -38,6 +44,7 @@ class Received:
         rows = slice(chunk.first, chunk.first + chunk.count)
         for name, values in columns.items():
             self._columns[name][rows] = values
+        self._enlarge = min(self._enlarge, chunk.enlarge)
         if chunk.part == "core":
             self._present[rows] = True
 
@@ -53,7 +60,7 @@ class Received:
         return Gaussians(
             means=take["means"],
             quats=take["quats"],
-            scales=take["scales"],
+            scales=take["scales"] if self._enlarge == 1 or not len(rows) else take["scales"] * self._enlarge,
             opacities=take["opacities"][:, 0],
             features_dc=take["features_dc"],
             features_rest=take["features_rest"].reshape(len(rows), -1, 3),

@@ -1,26 +1,29 @@
 """From a scene to a stream: a folder of two files that any web server can serve."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from freqgs_plugin.functional.attenuation import DistanceDecay
 from freqgs_plugin.rendering.base import get_rasterizer
+from freqgs_plugin.rendering.render import render
 from freqgs_plugin.stream.chunks import Columns, checksum, encode_chunk
+from freqgs_plugin.stream.enlarging import enlargements
 from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.manifest import DATA, MANIFEST, Chunk, Level, Manifest
 from freqgs_plugin.stream.order import importance, size, streaming_order
-from freqgs_plugin.stream.quantise import NAMES, VARIANTS, Coding, coding_of
+from freqgs_plugin.stream.quantise import NAMES, VARIANTS, coding_of
 from freqgs_plugin.stream.scene import StreamScene
-from freqgs_plugin.types import Camera, Gaussians
+from freqgs_plugin.types import Camera, Gaussians, Rendering
 
 PARTS = ("core", "sh")
 LEAST_ROWS, MOST_ROWS = 256, 16384
+BASE_CUTS = 2
+"""the base's cores are cut into this many times as many chunks: something is seen sooner"""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ def save_stream(stream: Stream, folder: Path) -> None:
 
 
 def encode_stream(scene: StreamScene, options: StreamOptions) -> Stream:
-    """The stream, coarse levels first. See `order.importance` for the order within a level and for its time.
+    """The stream, coarse levels first. See `order` and `enlarging` for what takes time.
 
     Raises:
         StreamError: as `write_stream`.
@@ -85,26 +88,15 @@ def encode_stream(scene: StreamScene, options: StreamOptions) -> Stream:
     decays = gaussians.decay is not None
     if decays and not scene.scene_distance:
         raise StreamError("the Gaussians fade with distance, but the scene's distance is not known: name the run.")
-    gaussians = gaussians.select(_order(scene))
-    level = gaussians.level.cpu().numpy()
+    drawing = _drawing(scene)
+    gaussians = gaussians.select(_order(scene, drawing))
     columns = columns_of(gaussians)
-    levels, chunks, parts = [], [], []
-    for number in sorted(set(level.tolist())):
-        rows = np.flatnonzero(level == number)
-        own = {name: values[rows] for name, values in columns.items()}
-        try:
-            codings = tuple(coding_of(name, own[name], VARIANTS[options.variant]) for name in NAMES if name in own)
-        except ValueError as error:
-            raise StreamError(str(error)) from error
-        box = (tuple(own["means"].min(0).tolist()), tuple(own["means"].max(0).tolist()))
-        levels.append(Level(number, int(rows[0]), len(rows), box, codings))
-        for part, first, count in _cuts(codings, len(rows), options.chunks_per_level):
-            cut = {name: values[first : first + count] for name, values in own.items()}
-            data = encode_chunk([c for c in codings if c.part == part], cut)
-            offset = sum(map(len, parts))
-            chunks.append(Chunk(number, part, int(rows[0]) + first, count, offset, len(data), checksum(data)))
-            parts.append(data)
-    data = b"".join(parts)
+    levels: list[Level] = []
+    for number, count in zip(*(values.tolist() for values in gaussians.level.unique(return_counts=True)), strict=True):
+        levels.append(_level(number, sum(level.count for level in levels), count, columns, options))
+    cuts = [cut for level in levels for cut in _cuts(level, options.chunks_per_level, level is levels[0])]
+    factors = _enlargements(scene, gaussians, [cut for cut in cuts if cut[0] is levels[0]], drawing)
+    chunks, data = _chunks(cuts, factors, columns)
     manifest = Manifest(
         data=f"splats-{checksum(data):08x}.bin",
         variant=options.variant,
@@ -142,25 +134,72 @@ def view_json(name: str, camera: Camera) -> dict[str, Any]:
     return {"name": name, "viewmat": viewmat, "K": K, "width": camera.width, "height": camera.height}
 
 
-def _order(scene: StreamScene) -> torch.Tensor:
+def _drawing(scene: StreamScene) -> dict[str, Any]:
+    """How the scene's views are drawn."""
+    decays = scene.gaussians.decay is not None
+    return {
+        "rasterizer": get_rasterizer(scene.rasterizer, scene.gaussians.means.device, absgrad=False),
+        "antialiased": scene.antialiased,
+        "attenuation": DistanceDecay(1.0, "scene", scene.scene_distance) if decays else None,
+    }
+
+
+def _order(scene: StreamScene, drawing: dict[str, Any]) -> torch.Tensor:
     gaussians = scene.gaussians
     if not scene.cameras:
         return streaming_order(size(gaussians), gaussians.level)
-    attenuation = None if gaussians.decay is None else DistanceDecay(1.0, "scene", scene.scene_distance)
-    rasterizer = get_rasterizer(scene.rasterizer, gaussians.means.device, absgrad=False)
-    options = {"rasterizer": rasterizer, "antialiased": scene.antialiased, "attenuation": attenuation}
     with torch.no_grad():
-        return streaming_order(importance(gaussians, scene.cameras, **options), gaussians.level)
+        return streaming_order(importance(gaussians, scene.cameras, **drawing), gaussians.level)
 
 
-def _cuts(codings: tuple[Coding, ...], rows: int, cuts: int) -> Iterator[tuple[str, int, int]]:
-    """Part, first row and count of a level's chunks: all cores before any harmonics."""
-    length = min(max(-(-rows // cuts), LEAST_ROWS), MOST_ROWS)
+def _level(number: int, first: int, count: int, columns: Columns, options: StreamOptions) -> Level:
+    own = {name: values[first : first + count] for name, values in columns.items()}
+    try:
+        codings = tuple(coding_of(name, own[name], VARIANTS[options.variant]) for name in NAMES if name in own)
+    except ValueError as error:
+        raise StreamError(str(error)) from error
+    box = (tuple(own["means"].min(0).tolist()), tuple(own["means"].max(0).tolist()))
+    return Level(number, first, count, box, codings)
+
+
+_Cut = tuple[Level, str, int, int]
+"""level, part, first row and count of a chunk"""
+
+
+def _cuts(level: Level, cuts: int, base: bool) -> Iterator[_Cut]:
+    """A level's chunks: all cores before any harmonics."""
     for part in PARTS:
-        if part == "sh" and not any(c.kept or any(c.low) for c in codings if c.part == part):
+        if part == "sh" and not any(c.kept or any(c.low) for c in level.part(part)):
             continue
-        for first in range(0, rows, length):
-            yield part, first, min(length, rows - first)
+        wanted = cuts * BASE_CUTS if base and part == "core" else cuts
+        length = min(max(-(-level.count // wanted), LEAST_ROWS), MOST_ROWS)
+        for first in range(0, level.count, length):
+            yield level, part, level.first + first, min(length, level.count - first)
+
+
+def _chunks(cuts: Sequence[_Cut], factors: Sequence[float], columns: Columns) -> tuple[list[Chunk], bytes]:
+    """All chunks, and their bytes; `factors` are of the first ones."""
+    chunks, data = [], b""
+    for index, (level, part, first, rows) in enumerate(cuts):
+        cut = {name: values[first : first + rows] for name, values in columns.items()}
+        found = encode_chunk(level.part(part), cut)
+        factor = factors[index] if index < len(factors) else 1.0
+        chunks.append(Chunk(level.level, part, first, rows, len(data), len(found), checksum(found), factor))
+        data += found
+    return chunks, data
+
+
+def _enlargements(
+    scene: StreamScene, gaussians: Gaussians, cuts: Sequence[_Cut], drawing: dict[str, Any]
+) -> list[float]:
+    """Factors of the base's cores."""
+    ends = [first + rows for _, part, first, rows in cuts if part == "core"]
+
+    def draw(shown: Gaussians, camera: Camera) -> Rendering:
+        return render(shown, camera, background=scene.background, depth=False, **drawing)
+
+    with torch.no_grad():
+        return enlargements(gaussians.select(torch.arange(ends[-1])), ends, scene.cameras, draw)
 
 
 def replace_file(path: Path, contents: bytes) -> None:

@@ -21,12 +21,13 @@ from freqgs_plugin.reports.bench.trained import load, views_of, views_of_split
 from freqgs_plugin.reports.drawing import HeldOutView
 from freqgs_plugin.reports.tables import psnr
 from freqgs_plugin.stream.client import fetch
+from freqgs_plugin.stream.enlarging import without_holes
 from freqgs_plugin.stream.manifest import Chunk
 from freqgs_plugin.stream.received import Received
 from freqgs_plugin.stream.scene import StreamScene
 from freqgs_plugin.stream.server import Server
 from freqgs_plugin.stream.write import Stream
-from freqgs_plugin.types import Gaussians
+from freqgs_plugin.types import Gaussians, Rendering
 
 _TENSORS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 Pictures = list[Float[Tensor, "h w 3"]]
@@ -53,6 +54,8 @@ class Point:
     """mean PSNR, dB"""
     complete: float
     """mean PSNR against the run's own pictures, dB"""
+    covered: float
+    """of the view with most holes, the share of pixels that are none, beside the whole base"""
     gaussians: int
 
 
@@ -84,15 +87,29 @@ def subject_of_run(config: Path, name: str | None = None) -> StreamSubject:
     return StreamSubject(name or run.config.experiment_name, scene, views_of(run))
 
 
-def pictures(subject: StreamSubject, gaussians: Gaussians) -> Pictures:
-    """Of all views, as they are shown."""
+def renderings(subject: StreamSubject, gaussians: Gaussians) -> list[Rendering]:
+    """Of all views."""
     scene = subject.scene
     decay = None if gaussians.decay is None else DistanceDecay(1.0, "scene", scene.scene_distance)
     rasterizer = get_rasterizer(scene.rasterizer, gaussians.means.device, absgrad=False)
     options = {"rasterizer": rasterizer, "background": scene.background, "antialiased": scene.antialiased}
     with torch.no_grad():
-        found = [render(gaussians, v.camera, decay, depth=False, **options).features for v in subject.views]
-    return [picture.clamp(0, 1) for picture in found]
+        return [render(gaussians, v.camera, decay, depth=False, **options) for v in subject.views]
+
+
+def pictures(subject: StreamSubject, gaussians: Gaussians) -> Pictures:
+    """Of all views, as they are shown."""
+    return shown(renderings(subject, gaussians))
+
+
+def shown(found: Sequence[Rendering]) -> Pictures:
+    return [rendering.features.clamp(0, 1) for rendering in found]
+
+
+def covered(found: Sequence[Rendering], whole: Sequence[Rendering]) -> float:
+    """The share of pixels without holes, of the view that has least of them."""
+    pairs = zip(found, whole, strict=True)
+    return min(float(without_holes(part.alpha, all_of_it.alpha).float().mean()) for part, all_of_it in pairs)
 
 
 def quality(found: Pictures, expected: Sequence[Tensor]) -> float:
@@ -103,14 +120,16 @@ def quality(found: Pictures, expected: Sequence[Tensor]) -> float:
 
 def curve(subject: StreamSubject, stream: Stream) -> list[Point]:
     """After every chunk."""
-    received, own = Received(stream.manifest), pictures(subject, subject.scene.gaussians)
+    received, scene = Received(stream.manifest), subject.scene.gaussians
+    own, base = pictures(subject, scene), renderings(subject, scene.select(scene.level == scene.level.min()))
     photographs = [view.image for view in subject.views]
     points, begin = [], len(stream.manifest.text())
     for chunk in stream.manifest.chunks:
         end = chunk.offset + chunk.bytes
         received.add(chunk, stream.data[chunk.offset : end])
-        found = pictures(subject, received.gaussians())
-        qualities = quality(found, photographs), quality(found, own)
+        drawn = renderings(subject, received.gaussians())
+        found = shown(drawn)
+        qualities = quality(found, photographs), quality(found, own), covered(drawn, base)
         points.append(Point(chunk.level, chunk.part, begin + end, *qualities, received.count))
     return points
 

@@ -36,6 +36,7 @@ class Painter {
     gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(0, 1);
     this.count = 0;
+    this.enlarge = 1;
     this.sum = null;
   }
 
@@ -161,6 +162,7 @@ class Painter {
     gl.uniform4f(places.intrinsics, camera.fx, camera.fy, camera.cx, camera.cy);
     gl.uniform2f(places.size, width, height);
     gl.uniform1f(places.level, look.level);
+    gl.uniform1f(places.enlarge, this.enlarge);
     gl.uniform1f(places.distance_scale, look.scale);
     gl.uniform1f(places.scene_distance, m.decay ? m.decay.scene_distance : 0);
     gl.uniform1f(places.antialiased, m.render.antialiased ? 1 : 0);

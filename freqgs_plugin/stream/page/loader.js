@@ -29,10 +29,20 @@ const Loader = (() => {
   }
 
   function check(found) {
-    if (found.format !== "freqgs-stream" || found.version !== 1) {
-      throw new Refused(`manifest.json is ${found.format} of version ${found.version}; this reads freqgs-stream 1`);
+    if (found.format !== "freqgs-stream" || found.version !== 2) {
+      throw new Refused(
+        `manifest.json is ${found.format} of version ${found.version}; this reads freqgs-stream 2. Write the stream anew.`);
     }
-    return found;
+    // one list per field; steps and components that are all the same or all there are not listed
+    const columns = Object.entries(found.chunks);
+    const rows = found.chunks.offset.map((_, i) => Object.fromEntries(columns.map(([name, values]) => [name, values[i]])));
+    const levels = found.levels.map((level) => ({ ...level, codings: level.codings.map(unfold) }));
+    return { ...found, chunks: rows, levels };
+  }
+
+  function unfold(coding) {
+    const all = Array.from({ length: coding.components }, (_, k) => k);
+    return { ...coding, kept: coding.kept ?? all, step: all.map((k) => coding.step[k] ?? coding.step) };
   }
 
   // Calls arrived(entry, bytes) for each chunk that is right and received(count) for bytes; resolves to what is missing.

@@ -20,6 +20,7 @@ uniform vec3 eye;
 uniform vec4 intrinsics;             // fx fy cx cy
 uniform vec2 size;                   // px
 uniform float level;
+uniform float enlarge;               // of all axes, while part of the base is missing
 uniform float distance_scale;        // s_v
 uniform float scene_distance;        // 0: no decay
 uniform float antialiased, signed_residuals;
@@ -85,7 +86,7 @@ void main() {
 
   q /= max(length(q), 1e-20);
   float w = q.x, x = q.y, y = q.z, z = q.w;
-  vec3 stretch = min(s.xyz, vec3(1e8 * p.z / max(intrinsics.x, intrinsics.y)));
+  vec3 stretch = min(enlarge * s.xyz, vec3(1e8 * p.z / max(intrinsics.x, intrinsics.y)));
   mat3 M = mat3(
     stretch.x * vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
     stretch.y * vec3(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),

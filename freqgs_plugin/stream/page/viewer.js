@@ -7,7 +7,7 @@ const LARGEST_SCALE = 32;
 class Viewer {
   constructor() {
     this.look = { level: 1, scale: 1, budget: Infinity };
-    this.received = { bytes: 0, rows: 0, chunks: 0 };
+    this.received = { bytes: 0, rows: 0, chunks: 0, enlarge: Infinity };
     this.drawn = 0;
     this.sorts = { asked: 0, done: 0, milliseconds: 0 };
     this.waiting = new Map();
@@ -73,6 +73,8 @@ class Viewer {
     const columns = await Decode.chunk(this.manifest, entry, bytes);
     this.painter.add(entry, columns);
     this.received.chunks++;
+    // closes the holes of what is missing
+    this.received.enlarge = this.painter.enlarge = Math.min(this.received.enlarge, entry.enlarge);
     if (entry.part === "core") {
       if (!this.received.rows) this.measure(columns.means);
       this.received.rows += entry.count;
