@@ -157,8 +157,8 @@ def curve_table(curves: Mapping[str, list[Point]], plys: Mapping[str, int], vari
         dips = worst_dip([p.photographs for p in points]), worst_dip([p.complete for p in points])
         verdicts.append(
             f"**{name}**: the picture is without holes from {complete.bytes / total:.1%} of the stream's bytes on, "
-            f"{complete.bytes / plys[name]:.1%} of the PLY's, at first with {complete.complete:.1f} dB to the run's own (goal "
-            f"{GOAL_BASE:.0%} of the stream's: {_met(complete.bytes / total <= GOAL_BASE)}; of the PLY's: "
+            f"{complete.bytes / plys[name]:.1%} of the PLY's, at first with {complete.complete:.1f} dB to the run's "
+            f"own (goal {GOAL_BASE:.0%} of the stream's: {_met(complete.bytes / total <= GOAL_BASE)}; of the PLY's: "
             f"{_met(complete.bytes / plys[name] <= GOAL_BASE)}); all of the base's Gaussians are there after "
             f"{base / total:.0%} of the stream; all of it takes {whole['share']:.1%} at "
             f"{whole['loss']:.2f} dB loss, the smallest variant within {GOAL_LOSS} dB "

@@ -55,7 +55,7 @@ class Point:
     complete: float
     """mean PSNR against the run's own pictures, dB"""
     covered: float
-    """of the view with most holes, the share of pixels that are none beside the whole base (`enlarging.without_holes`)"""
+    """of the view with most holes, the share of pixels that are none, beside the whole base"""
     gaussians: int
 
 
