@@ -11,6 +11,7 @@ def stream(
     output_dir: Path = Path("stream-out"),
     variant: Literal["exact", "fine", "balanced", "small"] = "balanced",
     html: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write the Gaussians of a 3DGS PLY so that they are shown as they arrive: any part of them is a scene.
 
@@ -22,15 +23,22 @@ def stream(
         output_dir: folder for manifest.json and the file of chunks.
         variant: exact is float32, bit for bit; the others are quantised, see the documentation for errors and bytes.
         html: write one HTML file with the page and the scene in it instead.
+        overwrite: replace the stream, or the HTML file, that is there.
     """
     from rich.console import Console
 
     from freqgs_plugin.commands.options import CommandError
     from freqgs_plugin.commands.scene import open_scene
+    from freqgs_plugin.reports.bench.runner import check_folder
     from freqgs_plugin.stream.html import write_html
+    from freqgs_plugin.stream.manifest import MANIFEST
     from freqgs_plugin.stream.scene import StreamScene
     from freqgs_plugin.stream.write import StreamOptions, write_stream
 
+    target = output_dir / MANIFEST if html is None else html
+    if target.exists() and not overwrite:
+        raise CommandError(f"{target} exists; add --overwrite, or name another {'--html' if html else '--output-dir'}.")
+    check_folder(target.parent)
     try:
         scene = open_scene(None, ply, "auto")
     except ValueError as error:

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 from freqgs_plugin.stream.errors import StreamError
+from freqgs_plugin.stream.files import folder_for
 from freqgs_plugin.stream.scene import StreamScene
 from freqgs_plugin.stream.server import PAGE
 from freqgs_plugin.stream.write import Stream, StreamOptions, encode_stream, replace_file
@@ -27,8 +28,8 @@ def write_html(scene: StreamScene, path: Path, options: StreamOptions | None = N
             f"{len(stream.data) / 2**20:.0f} MiB are too much for one HTML file (at most {MOST_BYTES // 2**20}); write "
             "a stream and serve it (`freqgs serve`), or choose the variant small."
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, html_text(stream).encode())
+    with folder_for(path):
+        replace_file(path, html_text(stream).encode())
     return stream
 
 

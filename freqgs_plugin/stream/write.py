@@ -14,6 +14,7 @@ from freqgs_plugin.rendering.render import render
 from freqgs_plugin.stream.chunks import Columns, checksum, encode_chunk
 from freqgs_plugin.stream.enlarging import enlargements
 from freqgs_plugin.stream.errors import StreamError
+from freqgs_plugin.stream.files import folder_for
 from freqgs_plugin.stream.manifest import DATA, MANIFEST, Chunk, Level, Manifest
 from freqgs_plugin.stream.order import importance, size, streaming_order
 from freqgs_plugin.stream.quantise import NAMES, VARIANTS, coding_of
@@ -66,11 +67,12 @@ def save_stream(stream: Stream, folder: Path) -> None:
     """Write both files, the manifest last; files of an earlier stream are removed.
 
     Raises:
-        OSError: the folder cannot be written.
+        OSError: the folder cannot be written; an earlier stream is still there, and nothing new is.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    replace_file(folder / stream.manifest.data, stream.data)
-    replace_file(folder / MANIFEST, stream.manifest.text().encode())
+    data, manifest = folder / stream.manifest.data, folder / MANIFEST
+    with folder_for(data, manifest):
+        replace_file(data, stream.data)
+        replace_file(manifest, stream.manifest.text().encode())
     for path in folder.iterdir():
         if DATA.fullmatch(path.name) and path.name != stream.manifest.data:
             path.unlink()

@@ -1,11 +1,14 @@
 """`freqgs stream`, `freqgs serve` and `freqgs bench stream`, as a user calls them."""
 
+import errno
 import json
+import os
 import re
 import signal
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -85,6 +88,45 @@ def test_a_scene_without_harmonics_is_streamed(ply, tmp_path, variant):
     assert len(received) == 120 and received.features_rest.shape == (120, 0, 3)
     main(["stream", str(tmp_path / "plain.ply"), "--html", str(tmp_path / "plain.html"), "--variant", variant])
     assert (tmp_path / "plain.html").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("kind", ["folder", "html"])
+def test_what_is_there_is_replaced_only_if_asked(ply, tmp_path, capsys, kind):
+    out = tmp_path / "out" / "scene.html" if kind == "html" else tmp_path / "out"
+    arguments = ["stream", str(ply[0]), "--html" if kind == "html" else "--output-dir", str(out)]
+    main(arguments)
+    before = {path: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    with pytest.raises(SystemExit):
+        main([*arguments, "--variant", "small"])
+    assert "exists; add --overwrite" in " ".join(capsys.readouterr().err.split())
+    assert {path: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+    main([*arguments, "--variant", "small", "--overwrite"])
+    after = {path: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    assert after != before and len(after) == len(before)
+
+
+@pytest.mark.parametrize("there", [False, True])
+@pytest.mark.parametrize("kind", ["folder", "manifest", "html"])
+def test_a_full_disk_leaves_what_was_there(ply, tmp_path, monkeypatch, capsys, kind, there):
+    out = tmp_path / "new" / "out"
+    target = ["--html", str(out / "scene.html")] if kind == "html" else ["--output-dir", str(out)]
+    if there:
+        main(["stream", str(ply[0]), "--variant", "exact", *target])
+    before = {path: path.read_bytes() for path in (tmp_path / "new").rglob("*") if path.is_file()}
+    write = Path.write_bytes
+
+    def full(path, contents):
+        if kind != "manifest" or MANIFEST in path.name:
+            write(path, contents[: len(contents) // 2])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, contents)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(SystemExit):
+        main(["stream", str(ply[0]), *target, "--overwrite"])
+    assert "No space left" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in (tmp_path / "new").rglob("*") if path.is_file()} == before
+    assert (tmp_path / "new").exists() == there
 
 
 def test_one_file(ply, tmp_path):
