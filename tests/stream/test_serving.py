@@ -170,7 +170,8 @@ def test_a_bench_fills_its_page(tmp_path, monkeypatch):
     tables = json.loads((tmp_path / "stream.json").read_text())["tables"]
     rows = tables["stream-curve"]["rows"]
     # harmonics that are nothing are not sent
-    assert [row["what"] for row in rows] == ["first chunk", "level 1", "level 2", "level 3"]
+    assert [row["what"] for row in rows] == ["first chunk", "level 1", "without holes", "level 2", "level 3"]
+    assert rows[2]["covered"] == rows[1]["covered"] == 1.0
     assert [row["gaussians"] for row in rows][1:] == [50, 100, 150]
     (variant,), (line,) = tables["stream-variants"]["rows"], tables["stream-lines"]["rows"]
     assert rows[-1]["bytes"] == variant["bytes"] and variant["own"] > 35
