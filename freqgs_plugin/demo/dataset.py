@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from freqgs_plugin.demo.raytrace import World, depth_map, render_truth
+from freqgs_plugin.demo.raytrace import World, depth_map, render_truth, unproject
 from freqgs_plugin.demo.scene import build_world, orbit
+from freqgs_plugin.demo.vectors import transform
 from freqgs_plugin.io.check_images import SceneError
 from freqgs_plugin.io.colmap import Points, write_colmap
 from freqgs_plugin.io.images import to_uint8, write_image
@@ -106,9 +107,9 @@ def project(
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Pixel positions and camera z of world points; positions are meaningless where z <= 0."""
     viewmat, intrinsics = camera.viewmat.cpu().double().numpy(), camera.K.cpu().double().numpy()
-    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    local = transform(viewmat[:3, :3], points) + viewmat[:3, 3]
     z = local[:, 2]
-    image = local @ intrinsics.T
+    image = transform(intrinsics, local)
     return image[:, :2] / np.where(z > 0, z, 1)[:, None], z
 
 
@@ -151,9 +152,9 @@ def _draw(
     y, x = np.divmod(pixel, image.shape[1])
     z = depth[y, x].astype(np.float64)
     viewmat, intrinsics = camera.viewmat.cpu().double().numpy(), camera.K.cpu().double().numpy()
-    local = np.stack([x + 0.5, y + 0.5, np.ones(count)], 1) @ np.linalg.inv(intrinsics).T * z[:, None]
+    local = unproject(intrinsics, x + 0.5, y + 0.5) * z[:, None]
     local += rng.normal(0, 0.5, local.shape) * (z / intrinsics[0, 0])[:, None]
-    return (local - viewmat[:3, 3]) @ viewmat[:3, :3], to_uint8(image)[y, x]
+    return transform(viewmat[:3, :3].T, local - viewmat[:3, 3]), to_uint8(image)[y, x]
 
 
 def _visible(

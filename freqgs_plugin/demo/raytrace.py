@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from freqgs_plugin.demo.shapes import Kind, face_size, intersect, surface
 from freqgs_plugin.demo.textures import Number, Texture
+from freqgs_plugin.demo.vectors import dot, length, normalise, transform
 from freqgs_plugin.types import Camera
 
 Vectors = Float[np.ndarray, "n 3"]
@@ -58,15 +59,14 @@ class Solid:
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """Own axes to world."""
         (cz, sz), (cx, sx) = ((np.cos(np.radians(a)), np.sin(np.radians(a))) for a in (self.yaw, self.tilt))
-        turn = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        return (turn @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])).astype(np.float32)
+        return np.array([[cz, -sz * cx, sz * sx], [sz, cz * cx, -cz * sx], [0, sx, cx]]).astype(np.float32)
 
     @property
     def bound(self) -> float:
         """Radius of a sphere around the centre that holds the solid, world units."""
         x, y, z = self.half
         corner = {"sphere": max(x, y, z), "cylinder": float(np.hypot(max(x, y), z))}
-        return corner.get(self.kind, float(np.linalg.norm(self.half)))
+        return corner.get(self.kind, float(length(np.array(self.half, np.float64))))
 
     @property
     def position(self) -> Float[np.ndarray, " 3"]:
@@ -80,7 +80,7 @@ class Solid:
 
     def to_unit(self, vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """World vectors (not points) in unit coordinates."""
-        return (vectors @ self.rotation) / self.extent
+        return transform(self.rotation.T, vectors) / self.extent
 
 
 @dataclass(frozen=True)
@@ -106,13 +106,19 @@ class World:
     lamp: Lamp
 
 
+def unproject(
+    intrinsics: Float[np.ndarray, "3 3"], x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Points of camera z 1 that are seen at the pixel positions (x, y); camera axes. Skew is taken to be 0."""
+    (fx, _, cx), (_, fy, cy) = intrinsics[:2]
+    return np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], 1)
+
+
 def pixel_rays(camera: Camera, dx: Number = 0.5, dy: Number = 0.5) -> tuple[Float[np.ndarray, " 3"], Vectors]:
     """Camera centre, and unit directions through the points (x + dx, y + dy) of all pixels, row by row; world."""
     intrinsics, viewmat = camera.K.cpu().double().numpy(), camera.viewmat.cpu().double().numpy()
     y, x = np.mgrid[0 : camera.height, 0 : camera.width]
-    points = np.stack([x.ravel() + dx, y.ravel() + dy, np.ones(x.size)], 1)
-    directions = points @ np.linalg.inv(intrinsics).T @ viewmat[:3, :3]
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = normalise(transform(viewmat[:3, :3].T, unproject(intrinsics, x.ravel() + dx, y.ravel() + dy)))
     return camera.centre.cpu().numpy().astype(np.float32), directions.astype(np.float32)
 
 
@@ -147,11 +153,11 @@ def cast(
 def _candidates(item: Solid, origin: Float[np.ndarray, " 3"], directions: Vectors) -> Int[np.ndarray, " m"] | None:
     """Rays inside of the cone around the solid's bounding sphere; None means all."""
     offset = item.position - origin
-    distance = float(np.linalg.norm(offset))
+    distance = float(length(offset))
     if item.kind == "room" or distance <= item.bound:
         return None
     cosine = np.sqrt(1 - (item.bound / distance) ** 2)
-    return np.flatnonzero(directions @ (offset / distance) >= cosine - 1e-6)
+    return np.flatnonzero(dot(directions, offset / distance) >= cosine - 1e-6)
 
 
 def _shade(
@@ -162,7 +168,7 @@ def _shade(
     distance, index = cast(world.solids, origin, directions)
     points = origin + distance[:, None] * directions
     to_lamp = lamp - points
-    lamp_distance = np.linalg.norm(to_lamp, axis=1)
+    lamp_distance = length(to_lamp)
     to_lamp /= lamp_distance[:, None]
     blocked = cast(world.solids[1:], lamp, -to_lamp)[0] < lamp_distance * np.float32(1 - SHADOW_MARGIN)
     colours = np.zeros_like(directions)
@@ -170,12 +176,11 @@ def _shade(
         rows = np.flatnonzero(index == i)
         albedo, normal = _material(world.solids[i], points[rows], directions[rows], distance[rows] * spacing)
         lit = ~blocked[rows]
-        facing = np.maximum((normal * to_lamp[rows]).sum(1), 0) * lit
+        facing = np.maximum(dot(normal, to_lamp[rows]), 0) * lit
         ambient = AMBIENT * (0.85 + 0.15 * normal[:, 2])
-        half = to_lamp[rows] - directions[rows]
-        half /= np.linalg.norm(half, axis=1, keepdims=True)
+        half = normalise(to_lamp[rows] - directions[rows])
         item = world.solids[i]
-        highlight = item.specular * lit * np.maximum((normal * half).sum(1), 0) ** item.shininess
+        highlight = item.specular * lit * np.maximum(dot(normal, half), 0) ** item.shininess
         colours[rows] = albedo * (ambient + DIFFUSE * facing)[:, None] + highlight[:, None]
     return colours
 
@@ -185,9 +190,8 @@ def _material(
 ) -> tuple[Vectors, Vectors]:
     """Albedo and unit normal (towards the viewer). `footprint`: distance between neighbouring rays, world."""
     hits = surface(item.kind, item.to_unit(points - item.position))
-    normal = (hits.normal / item.extent) @ item.rotation.T
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    cosine = -(normal * directions).sum(1)
+    normal = normalise(transform(item.rotation, hits.normal / item.extent))
+    cosine = -dot(normal, directions)
     normal = np.where(cosine[:, None] < 0, -normal, normal)
     sizes = face_size(item.kind, item.extent)
     albedo = np.empty_like(points)
@@ -223,5 +227,5 @@ def depth_map(world: World, camera: Camera) -> Float[np.ndarray, "h w"]:
     """Camera z of what the ray through each pixel's centre hits, world units."""
     origin, directions = pixel_rays(camera)
     distance, _ = cast(world.solids, origin, directions)
-    z = directions @ camera.viewmat[2, :3].cpu().numpy().astype(np.float32)
+    z = dot(directions, camera.viewmat[2, :3].cpu().numpy().astype(np.float32))
     return (distance * z).reshape(camera.height, camera.width)

@@ -1,6 +1,6 @@
 """The demo scene: a room with a laid table. Sizes differ by a factor of 100, textures go from none to fine.
 
-World: metres, z up, the table's centre above the origin. Everything follows from a seed.
+World: metres, z up, the table's centre above the origin. Everything follows from a seed, on any processor alike.
 """
 
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from freqgs_plugin.demo.raytrace import Lamp, Solid, Surface, Triple, World
 from freqgs_plugin.demo.textures import Number, Texture, checker, gradient, photo, solid, wood
+from freqgs_plugin.demo.vectors import normalise, transform
 from freqgs_plugin.types import Camera
 
 TABLE_HEIGHT = 0.75
@@ -144,12 +145,11 @@ def look_at(
     eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], width: int, height: int, fov: Number = 58.0
 ) -> Camera:
     """A camera at `eye` that sees `target` in its middle, world z up; `fov` is the horizontal angle in degrees."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
+    forward = normalise(target - eye)
+    right = normalise(np.cross(forward, (0.0, 0.0, 1.0)))
     rotation = np.stack([right, np.cross(forward, right), forward])
     viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -transform(rotation, eye)
     focal = width / 2 / np.tan(np.radians(fov) / 2)
     intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(intrinsics).float(), width, height)
@@ -179,6 +179,5 @@ def zoom_path(
     """
     item = next(s for s in world.solids if s.name == ZOOM_TARGET)
     target = np.array(item.centre)
-    direction = np.array([0.60, -0.80, 0.42])
-    direction /= np.linalg.norm(direction)
+    direction = normalise(np.array([0.60, -0.80, 0.42]))
     return [look_at(target + d * direction, target, width, height) for d in np.geomspace(near, far, count)]

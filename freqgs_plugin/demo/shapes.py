@@ -12,6 +12,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
+from freqgs_plugin.demo.vectors import dot
+
 Vectors = Float[np.ndarray, "n 3"]
 Distances = Float[np.ndarray, " n"]
 Kind = Literal["room", "box", "sphere", "cylinder"]
@@ -59,14 +61,14 @@ def _quadratic(a: Distances, half_b: Distances, c: float) -> tuple[Distances, Di
 
 
 def _sphere(origin: Float[np.ndarray, " 3"], direction: Vectors) -> Distances:
-    near, _ = _quadratic((direction**2).sum(1), direction @ origin, float(origin @ origin) - 1)
+    near, _ = _quadratic(dot(direction, direction), dot(direction, origin), float(dot(origin, origin)) - 1)
     return np.where(near > EPSILON, near, np.inf)
 
 
 def _cylinder(origin: Float[np.ndarray, " 3"], direction: Vectors) -> Distances:
     """The intersection of the infinite cylinder's interval with that of the slab |z| <= 1."""
-    xy = direction[:, :2]
-    near, far = _quadratic((xy**2).sum(1), xy @ origin[:2], float(origin[:2] @ origin[:2]) - 1)
+    xy, start = direction[:, :2], origin[:2]
+    near, far = _quadratic(dot(xy, xy), dot(xy, start), float(dot(start, start)) - 1)
     inverse = 1 / np.where(np.abs(direction[:, 2]) < 1e-12, np.float32(1e-12), direction[:, 2])
     first, second = (-1 - origin[2]) * inverse, (1 - origin[2]) * inverse
     near = np.maximum(near, np.minimum(first, second))

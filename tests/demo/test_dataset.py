@@ -1,4 +1,7 @@
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -21,6 +24,20 @@ def test_the_same_seed_gives_the_same_files_and_another_seed_others(tmp_path):
     assert first == second
     assert first["images/view_003.png"] != third["images/view_003.png"]
     assert first["sparse/0/points3D.bin"] != third["sparse/0/points3D.bin"]
+
+
+@pytest.mark.slow
+def test_another_processors_matrix_products_give_the_same_files(tmp_path):
+    """OpenBLAS can be told which processor to compute for; matrix products in float32 then differ."""
+    write = (
+        "import sys; from pathlib import Path; from freqgs_plugin.demo.dataset import SceneOptions, write_scene;"
+        "write_scene(Path(sys.argv[1]), SceneOptions(9, 80, 64, 300, 1), progress=False)"
+    )
+    for kind in ("Haswell", "Nehalem"):
+        environment = {**os.environ, "OPENBLAS_CORETYPE": kind}
+        subprocess.run([sys.executable, "-c", write, str(tmp_path / kind)], env=environment, check=True)
+    write_scene(tmp_path / "own", SceneOptions(9, 80, 64, 300, 1), progress=False)
+    assert _files(tmp_path / "own") == _files(tmp_path / "Haswell") == _files(tmp_path / "Nehalem")
 
 
 def test_a_scene_of_ours_is_replaced_and_leaves_no_old_views(tmp_path):
