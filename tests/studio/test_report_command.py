@@ -103,7 +103,7 @@ def test_a_plain_model_is_cut(make_trainer, trained, tmp_path, capsys):
     more = ["--shares", "1", "0.5", "--rounds", "1", "--views", "2", "--docs", str(page)]
     main(["report", *configs(plain, trained), *more, "--output-dir", str(tmp_path / "out")])
     said = capsys.readouterr().out
-    assert "No error against training time for plain: it was not evaluated" in said
+    assert "No error against training time for plain: it has a tensorboard log in which nothing can be read" in said
     assert "--steps-per-eval-all-images" in said
     record = json.loads((tmp_path / "out" / "report.json").read_text())
     assert record["views"]["measured"] == 2 and "error_training" not in record["files"]
@@ -151,9 +151,9 @@ def spoilt(name, trained, faded, folder):
     ("name", "message"),
     [
         ("nowhere", "nowhere.yml is no file"),
-        ("none", "holds no step-*.ckpt"),
-        ("truncated", "damaged, or another version wrote it"),
-        ("empty", "damaged, or another version wrote it"),
+        ("none", "holds no step-000000000.ckpt"),
+        ("truncated", "cannot be loaded: it is truncated or damaged"),
+        ("empty", "cannot be loaded: it is truncated or damaged"),
         ("other method", "made by another method"),
         ("older version", "another version wrote it (KeyError: 'strategy')"),
         ("config", "damaged, or another version wrote it"),
