@@ -173,6 +173,7 @@ def test_a_bench_fills_its_page(tmp_path, monkeypatch):
     # harmonics that are nothing are not sent
     expected = ["first chunk", "level 1", "without holes", "complete picture", "level 2", "level 3"]
     assert [row["what"] for row in rows] == expected
+    assert all(row["covered"] >= 0.99 for row in rows[2:])
     assert [row["gaussians"] for row in rows][1:] == [50, 50, 50, 100, 150]
     (variant,), (line,) = tables["stream-variants"]["rows"], tables["stream-lines"]["rows"]
     assert rows[-1]["bytes"] == variant["bytes"] and variant["own"] > 35
