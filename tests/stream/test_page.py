@@ -13,6 +13,7 @@ from freqgs_plugin.stream.client import fetch
 from freqgs_plugin.stream.errors import StreamError
 from freqgs_plugin.stream.html import write_html
 from freqgs_plugin.stream.manifest import MANIFEST
+from freqgs_plugin.stream.received import Received
 from freqgs_plugin.stream.write import StreamOptions, write_stream
 
 pytestmark = pytest.mark.browser
@@ -119,6 +120,24 @@ def test_half_a_stream_shows_the_base(visit, stream):
     stall.go.set()
     page.loaded()
     assert page.capture()[1] == len(gaussians)
+
+
+def test_part_of_the_base_is_drawn_larger(visit, tmp_path):
+    manifest = write_stream(small_scene(4000, levels=1), tmp_path, StreamOptions("balanced"))
+    first, received = manifest.chunks[0], Received(manifest)
+    received.add(first, (tmp_path / manifest.data).read_bytes()[: first.bytes])
+    part = received.gaussians()
+    stall = stalling(first.bytes + 10)
+    page = visit(stall, folder=tmp_path)
+    page.until("freqgs.received.chunks === 1")
+    picture, drawn = page.capture()
+    assert agreement(picture, ours(part, manifest)[0]) > GOAL and drawn == first.count
+    assert first.enlarge > 1
+    smaller = replace(part, scales=part.scales / first.enlarge)
+    assert agreement(picture, ours(smaller, manifest)[0]) < GOAL
+    stall.go.set()
+    picture, _ = page.loaded().capture()
+    assert agreement(picture, ours(fetch(tmp_path).received.gaussians(), manifest)[0]) > GOAL
 
 
 def test_on_a_phone(visit, stream):
