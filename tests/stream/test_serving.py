@@ -20,7 +20,8 @@ from freqgs_plugin.cli import main
 from freqgs_plugin.io.parameters import RawGaussians
 from freqgs_plugin.io.ply import read_ply, write_ply
 from freqgs_plugin.reports.bench import stream_measure
-from freqgs_plugin.reports.bench.stream_measure import worst_dip
+from freqgs_plugin.reports.bench.stream_measure import Point
+from freqgs_plugin.reports.bench.stream_verdict import complete_from, without_holes_from, worst_dip
 from freqgs_plugin.stream.client import fetch
 from freqgs_plugin.stream.manifest import MANIFEST
 
@@ -170,16 +171,29 @@ def test_a_bench_fills_its_page(tmp_path, monkeypatch):
     tables = json.loads((tmp_path / "stream.json").read_text())["tables"]
     rows = tables["stream-curve"]["rows"]
     # harmonics that are nothing are not sent
-    assert [row["what"] for row in rows] == ["first chunk", "level 1", "without holes", "level 2", "level 3"]
+    expected = ["first chunk", "level 1", "without holes", "complete picture", "level 2", "level 3"]
+    assert [row["what"] for row in rows] == expected
     assert all(row["covered"] >= 0.99 for row in rows[2:])
-    assert [row["gaussians"] for row in rows][1:] == [50, 50, 100, 150]
+    assert [row["gaussians"] for row in rows][1:] == [50, 50, 50, 100, 150]
     (variant,), (line,) = tables["stream-variants"]["rows"], tables["stream-lines"]["rows"]
     assert rows[-1]["bytes"] == variant["bytes"] and variant["own"] > 35
-    assert 0 < line["stream"]["first"] <= line["stream"]["base"] <= line["stream"]["full"]
+    assert 0 < line["stream"]["first"] <= line["stream"]["complete"] <= line["stream"]["base"] <= line["stream"]["full"]
     assert "small" in page.read_text() and (tmp_path / "images" / "bench_stream.png").is_file()
 
 
 TABLES = ("stream-curve", "stream-variants", "stream-lines")
+
+
+def test_a_complete_picture_has_no_holes_and_is_near_the_base_from_then_on():
+    def point(covered, complete, part="core"):
+        return Point(1, part, 0, 0.0, complete, covered, 0)
+
+    points = [point(1.0, 12.0), point(0.98, 18.0), point(1.0, 17.9), point(1.0, 18.1), point(1.0, 21.0)]
+    points.append(point(1.0, 40.0, "sh"))
+    # a picture of blobs has no holes, and says little
+    assert (without_holes_from(points), complete_from(points)) == (2, 3)
+    assert without_holes_from([point(1.0, 12.0)] * 2) == 0
+    assert without_holes_from([point(0.5, 12.0)] * 2) == 1
 
 
 def test_the_worst_dip():

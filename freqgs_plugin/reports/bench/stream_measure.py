@@ -65,6 +65,8 @@ class Times:
 
     first: float
     """something is seen"""
+    complete: float
+    """the picture is complete"""
     base: float
     """all Gaussians of the base are"""
     full: float
@@ -134,14 +136,6 @@ def curve(subject: StreamSubject, stream: Stream) -> list[Point]:
     return points
 
 
-def worst_dip(values: Sequence[float]) -> float:
-    """How far a value lies under the best before it, at most; 0 where none does."""
-    best, worst = -float("inf"), 0.0
-    for value in values:
-        worst, best = max(worst, best - value), max(best, value)
-    return worst
-
-
 def ply_of(gaussians: Gaussians, antialiased: bool, path: Path) -> int:
     """Write the scene as a PLY without normals; its bytes."""
     raw = RawGaussians(
@@ -171,8 +165,8 @@ def serving(folder: Path, mbits: float | None = None) -> Iterator[str]:
             thread.join()
 
 
-def stream_times(folder: Path, mbits: float) -> Times:
-    """Fetch and decode a stream over a slow line."""
+def stream_times(folder: Path, mbits: float, complete: int) -> Times:
+    """Fetch and decode a stream over a slow line; with the chunk `complete` the picture is complete."""
     found: dict[str, float] = {}
     base: list[tuple[int, str]] = []
     with serving(folder, mbits) as url:
@@ -181,6 +175,8 @@ def stream_times(folder: Path, mbits: float) -> Times:
         def arrived(chunk: Chunk, _bytes: int) -> None:
             found.setdefault("first", time.monotonic() - start)
             base.append((chunk.level, chunk.part))
+            if len(base) == complete + 1:
+                found["complete"] = time.monotonic() - start
             # the cores of the base come first
             if base[-1] == base[0]:
                 found["base"] = time.monotonic() - start
@@ -188,7 +184,7 @@ def stream_times(folder: Path, mbits: float) -> Times:
         fetched = fetch(url, arrived=arrived)
         full = time.monotonic() - start
     assert fetched.complete
-    return Times(found["first"], found["base"], full)
+    return Times(found["first"], found["complete"], found["base"], full)
 
 
 def ply_seconds(path: Path, mbits: float) -> float:
