@@ -23,9 +23,11 @@ ARGUMENTS = [
 WINDOW = {"width": 1280, "height": 720}
 PANEL = 330
 """px at the right edge that belong to the controls"""
-PATIENCE = 90
+PATIENCE = 180
 """seconds for anything to happen"""
 DRAWN = re.compile(r"^([\d,]+) / ([\d,]+), (\d+) ms$")
+FULL = "Resolution: 512x"
+"""what the page says of a picture of full size; nerfstudio draws a smaller one first"""
 
 
 def free_port():
@@ -114,12 +116,16 @@ class Page:
 
         def quiet():
             before = self.drawn()
-            if before is None or before[0] != count:
+            if before is None or before[0] != count or not self.full():
                 return False
             self.page.wait_for_timeout(1500)
             return self.drawn() == before and before
 
         return wait_until(quiet, f"{count} Gaussians to be drawn; it says {self.drawn()}")
+
+    def full(self):
+        """Whether the picture is the one of full size."""
+        return FULL in self.page.locator("body").inner_text()
 
     def look(self):
         """The rendered part of the page."""

@@ -82,7 +82,7 @@ def still(page):
     def again():
         page.page.wait_for_timeout(500)
         found.append(page.look())
-        return np.array_equal(*found[-2:])
+        return page.full() and np.array_equal(*found[-2:])
 
     wait_until(again, "a picture that stays")
     return found[-1]
