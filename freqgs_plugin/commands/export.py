@@ -42,6 +42,7 @@ def _export(options: ExportOptions, console: "Console") -> list[Path]:
     if options.format not in FORMATS:
         raise ValueError(f"--format {options.format}: unknown. Choose one of: {', '.join(FORMATS)}.")
     chosen = FORMATS[options.format]
+    _check_use(options)
     paths = targets(options.output_dir, chosen.name, "json")
     check_targets(paths, options.overwrite)
     source = open_source(options)
@@ -68,6 +69,22 @@ def _export(options: ExportOptions, console: "Console") -> list[Path]:
         write_all({options.docs: fill(page, place, text).encode()})
     _tell(table, source, paths, console)
     return paths
+
+
+_OF_FORMATS = {"variant": ("stream", "html"), "sog": ("levels",)}
+"""options and the formats that heed them"""
+
+
+def _check_use(options: ExportOptions) -> None:
+    """Refuse what would do nothing."""
+    for name, formats in _OF_FORMATS.items():
+        if getattr(options, name) != getattr(ExportOptions, name) and options.format not in formats:
+            option = f"--variant {options.variant}" if name == "variant" else "--no-sog"
+            raise ValueError(f"{option} does nothing with --format {options.format}, but with {', '.join(formats)}.")
+    for name in ("bake_steps", "seed") if not options.bake else ():
+        if getattr(options, name) != getattr(ExportOptions, name):
+            option = f"--{name.replace('_', '-')} {getattr(options, name)}"
+            raise ValueError(f"{option} does nothing without --bake; add --bake, or leave it out.")
 
 
 def _place(source: Source, options: ExportOptions) -> str:

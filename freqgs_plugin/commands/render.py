@@ -100,6 +100,8 @@ def _check(options: RenderOptions) -> Amount | None:
 
 def _check_pairs(options: RenderOptions) -> None:
     """Refuse what would do nothing without another option."""
+    if options.path is not None and options.split != RenderOptions.split:
+        raise ValueError(f"--split {options.split} does nothing with --path, whose views are drawn; leave one out.")
     pairs = {"gaze": ("gaze_scale", "gaze_sigma", "gaze_radius"), "focus": ("focus_outside", "segmenter_weights")}
     for needed, names in pairs.items():
         for name in names if getattr(options, needed) is None else ():

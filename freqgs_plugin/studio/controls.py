@@ -29,7 +29,7 @@ def uninterrupted() -> Iterator[None]:
     """A block that the viewer does not interrupt.
 
     It abandons a render by raising from a trace function on whatever line comes next. In the middle of an import that
-    leaves a broken module behind, and the thread that draws dies of it at the next picture.
+    leaves a broken module behind, and while numba loads a kernel it becomes a SystemError: the thread that draws dies.
     """
     trace = sys.gettrace()
     sys.settrace(None)

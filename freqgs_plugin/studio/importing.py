@@ -44,6 +44,8 @@ def write_run(exported: Exported, settings: RunSettings) -> Path:
         SceneError: the photographs cannot be read.
         OSError: the run cannot be written.
     """
+    if Path(settings.experiment).name != settings.experiment or settings.experiment == "..":
+        raise ValueError(f"--experiment-name {settings.experiment}: give the name of a folder, without a path.")
     config = _config(exported, settings)
     pipeline = _pipeline(config, settings.data)
     outputs = pipeline.datamanager.train_dataparser_outputs
@@ -149,7 +151,7 @@ def _state(pipeline: Any, raw: RawGaussians, exported: Exported, method: str) ->
     state.update({f"_model.gauss_params.{name}": value for name, value in groups.items()})
     level = raw.level if raw.level is not None and method == "lapsplat" else torch.ones(len(raw), dtype=torch.int32)
     state["_model.level"] = level
-    extra = {**state["_model._extra_state"], "step": 0, "sh_degree": raw.sh_degree, "strategy": {}}
+    extra = {**state["_model._extra_state"], "step": 0, "sh_degree": raw.sh_degree, "strategy": {}, "imported": True}
     if method == "lapsplat":
         extra.update(stage=int(level.max()), num_levels=int(level.max()))
     else:

@@ -46,7 +46,7 @@ class FreqSplatModel(SplatViews):
         self._scale = 1.0
         self._info: dict[str, Any] | None = None
         self._step_is_finite = True
-        self._trimmed = False
+        self._trimmed = self._imported = False
         self._targets = TargetCache(self.config.target_cache_mb)
         self.strategy = self._make_strategy()
         self.strategy_state: dict[str, Any] = {"scene_scale": 1.0, **dict.fromkeys(_STATISTICS)}
@@ -156,6 +156,11 @@ class FreqSplatModel(SplatViews):
             raise ValueError(
                 "this run was written by `freqgs trim`: the state of its optimizers was left out, and training cannot "
                 "go on. Resume the run that it was made from, and trim it again when it has finished."
+            )
+        if self._imported:
+            raise ValueError(
+                "this run was written by `freqgs import`: it was not trained here, and there is nothing to resume. "
+                "`ns-train clodsplat --pipeline.model.init-from` its config.yml trains on from its Gaussians."
             )
         if not resumed:
             steps = trainer.config.max_num_iterations
@@ -356,6 +361,7 @@ class FreqSplatModel(SplatViews):
             "steps_scale": self._scale,
             "sh_degree": self._sh_degree,
             "trimmed": self._trimmed,
+            "imported": self._imported,
             "strategy": {k: self.strategy_state[k] for k in _STATISTICS if self.strategy_state[k] is not None},
             "guard": self.guard.state(),
         }
@@ -365,6 +371,7 @@ class FreqSplatModel(SplatViews):
         self._scale = float(state["steps_scale"])
         self._sh_degree = int(state["sh_degree"])
         self._trimmed = bool(state.get("trimmed", False))
+        self._imported = bool(state.get("imported", False))
         for key in _STATISTICS:
             value = state["strategy"].get(key)
             self.strategy_state[key] = None if value is None else value.to(self.device)

@@ -1,6 +1,5 @@
 """What both methods show: splatfacto with a swappable rasterizer, its pictures, evaluation and export."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -211,7 +210,9 @@ class SplatViews(SplatfactoModel):
             pose = self.camera_optimizer.apply_to_camera(camera)
             index = (camera.metadata or {}).get("cam_idx")
             return self._training_outputs(to_camera(camera, pose, halvings=self._halvings()), background, index)
-        return self._view_outputs(to_camera(camera), background)
+        # abandoned in the middle, numba's loading of a kernel ends the thread that draws
+        with uninterrupted():
+            return self._view_outputs(to_camera(camera), background)
 
     @torch.no_grad()
     def _view_outputs(self, camera: Camera, background: Tensor) -> dict[str, Any]:
@@ -219,9 +220,7 @@ class SplatViews(SplatfactoModel):
         gaussians = self._viewer_gaussians() if viewer else self.gaussians()
         if self.crop_box is not None:
             gaussians = gaussians.select(self.crop_box.within(gaussians.means).flatten())
-        # the first picture imports and compiles
-        finish = uninterrupted() if self._rasterizer is None else nullcontext()
-        with Stopwatch(self.device) as watch, finish:
+        with Stopwatch(self.device) as watch:
             if viewer:
                 rendering = self._viewer_rendering(gaussians, camera, background)
             else:

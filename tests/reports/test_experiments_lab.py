@@ -50,6 +50,15 @@ def test_a_damaged_step_is_named(tmp_path):
         store.read("curve", {})
 
 
+def test_an_edited_result_is_named(tmp_path):
+    store = Store(tmp_path)
+    store.write("curve", {}, {"psnr": 27.0}, 0.0)
+    path = store.path("curve", {})
+    path.write_text(path.read_text().replace("27.0", "28.0"))
+    with pytest.raises(ExperimentError, match=r"its result was changed.*the step is done again"):
+        store.read("curve", {})
+
+
 def test_a_training_is_done_once(tmp_path):
     lab, tools = fake_lab(tmp_path)
     path = lab.config_path(TRIAL.clod())

@@ -279,6 +279,22 @@ class TestImport:
         said = freqgs("render", "--load-config", config, "--output-dir", tmp_path / "pictures", "--level", 1)
         assert "3 frames" in said
 
+    def test_there_is_nothing_to_resume(self, plain_run, tmp_path, freqgs, make_trainer):
+        freqgs("export", "--load-config", plain_run, "--output-dir", tmp_path)
+        freqgs("import", tmp_path / "splat.ply", "--output-dir", tmp_path / "runs")
+        folder = imported(tmp_path / "runs").parent
+        with pytest.raises(ValueError, match=r"written by `freqgs import`.*init-from"):
+            make_trainer(load_dir=folder / "nerfstudio_models", num_levels=1)
+        started = make_trainer(method="clodsplat", init_from=folder)
+        assert started.pipeline.model.num_points == load_run(folder / "config.yml").model.num_points
+
+    def test_a_path_is_no_name(self, plain_run, scene, tmp_path, refused):
+        write_ply(tmp_path / "theirs.ply", load_run(plain_run).raw)
+        for name in ("../../elsewhere", "/elsewhere", ".."):
+            more = ("--output-dir", tmp_path / "runs" / "deep", "--data", scene, f"--experiment-name={name}")
+            assert "give the name of a folder" in refused("import", tmp_path / "theirs.ply", *more)
+        assert not (tmp_path / "runs").exists()
+
     def test_a_file_of_others_needs_the_photographs(self, plain_run, scene, tmp_path, freqgs, refused):
         raw = load_run(plain_run).raw
         write_ply(tmp_path / "theirs.ply", raw)
@@ -310,6 +326,11 @@ class TestBadInput:
         assert "this scene has levels 1..3" in refused("export", *more, "--level", 7)
         assert "this one has none" in refused("export", *more, "--distance", 0.5)
         assert "this scene has no decay" in refused("export", *more, "--extra", "decay")
+        assert "--variant small does nothing with --format ply, but with stream" in refused(
+            "export", *more, "--variant", "small"
+        )
+        assert "--no-sog does nothing with --format ply" in refused("export", *more, "--no-sog")
+        assert "--bake-steps 5 does nothing without --bake" in refused("export", *more, "--bake-steps", 5)
         assert "give --load-config" in refused("export", "--output-dir", tmp_path / "out")
         assert not (tmp_path / "out").exists()
 

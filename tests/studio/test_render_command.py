@@ -172,6 +172,7 @@ def test_focus_from_masks_and_from_a_box(trained, tmp_path, render):
         (("--gaze", "0.5,0.5", "--gaze-scale", "0"), "0 times smaller: it must be"),
         (("--gaze", "0.5,0.5", "--gaze-scale", "100000"), "from 1 to 32"),
         (("--gaze-scale", "2"), "give --gaze"),
+        (("--path", "nowhere.json", "--split", "train"), "--split train does nothing with --path"),
         (("--gaze-sigma", "0.2"), "--gaze-sigma does nothing without --gaze"),
         (("--focus", "nowhere", "--focus-outside", "-3"), "--focus-outside is -3"),
         (("--load-config", "RUN", "--focus", "text: "), "names nothing"),

@@ -42,13 +42,17 @@ class Store:
             missing = [name for name in ("settings", "seconds", "date", "commit") if name not in record]
             if missing:
                 raise ValueError(f"without {', '.join(missing)}")
+            if record.get("digest", found := key({"result": record["result"]})) != found:
+                raise ValueError("its result was changed")
         except ValueError as error:
             raise ExperimentError(f"{path} is damaged ({error}); remove it, and the step is done again") from error
         return record if record.get("settings") == _as_json(settings) else None
 
     def write(self, name: str, settings: dict[str, Any], result: Any, seconds: float) -> dict[str, Any]:
         """Save a finished step in one piece, and return its record as `read` would. Infinite numbers become null."""
-        record = {**environment(), "name": name, "seconds": round(seconds, 1), "settings": settings, "result": result}
+        record = {**environment(), "name": name, "seconds": round(seconds, 1), "settings": settings}
+        record["result"] = json.loads(json.dumps(finite_json(result), allow_nan=False))
+        record["digest"] = key({"result": record["result"]})
         text = json.dumps(finite_json(record), indent=1, allow_nan=False)
         write_all({self.path(name, settings): text.encode() + b"\n"})
         return json.loads(text)
