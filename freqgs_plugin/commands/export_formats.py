@@ -13,7 +13,16 @@ from freqgs_plugin.commands.export_source import Source, select
 from freqgs_plugin.commands.export_streams import FOLDER, PAGE, check_stream, write_as_html, write_as_stream
 from freqgs_plugin.functional.similarity import Similarity
 from freqgs_plugin.io.ply import SplatFileError, write_ply
-from freqgs_plugin.io.splat_transform import INSTALL, NAME, find_tool, run_tool, streamed_command, tool_version
+from freqgs_plugin.io.splat_transform import (
+    INSTALL,
+    NAME,
+    find_tool,
+    finest_files,
+    run_tool,
+    streamed_command,
+    tool_version,
+)
+from freqgs_plugin.io.spz import mark_antialiased
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -62,7 +71,9 @@ def write_as_spz(source: Source, options: ExportOptions, work: Work) -> list[Wri
     made = plain(source, options, work.console)
     _write(work.folder / "in.ply", made, source, options)
     run_tool("-w", "in.ply", SPZ, folder=work.folder)
-    loss = _loss_of(SPZ, (), made, source, options, work.folder)
+    if made.mip:
+        mark_antialiased(work.folder / SPZ)
+    loss = _loss_of([work.folder / SPZ], made, source, options, work.folder)
     (work.folder / "in.ply").unlink()
     work.notes["tool"] = tool_version()
     return [Written(work.folder / SPZ, len(made.raw), loss, time.perf_counter() - begun, made.note)]
@@ -107,6 +118,7 @@ def write_as_levels(source: Source, options: ExportOptions, work: Work) -> list[
     work.notes.update(
         levels=source.levels,
         signed_residuals=source.signed,
+        viewer="mip" if prefixes[-1].mip else "classic",
         prefixes=names,
         deltas=[None if delta is None else delta.path.name for delta in deltas],
         streamed_sog=note,
@@ -173,16 +185,16 @@ def _streamed(
     count = sum(len(prefix.raw) for prefix in prefixes)
     if not (folder / STREAMED).is_file():
         raise SplatFileError(f"{NAME} wrote no {STREAMED}; it is too old, update it with `{INSTALL}`.")
-    loss = _loss_of(STREAMED, ("-L", "0"), made, source, options, folder)
+    loss = _loss_of(finest_files(folder / STREAMED), made, source, options, folder)
     note = f"streamed SOG of {len(prefixes)} levels of detail; loss of the finest one"
     return [Written((folder / STREAMED).parent, count, loss, time.perf_counter() - begun, note)]
 
 
-def _loss_of(
-    name: str, selection: tuple[str, ...], made: Plain, source: Source, options: ExportOptions, folder: Path
-) -> Loss:
-    """What a file of splat-transform's loses, by the PLY that it makes of it."""
-    run_tool("-w", *selection, name, "back.ply", folder=folder)
+def _loss_of(files: list[Path], made: Plain, source: Source, options: ExportOptions, folder: Path) -> Loss:
+    """What files of splat-transform's lose, by the PLY that it makes of them."""
+    run_tool("-w", *(file.resolve() for file in files), "back.ply", folder=folder)
+    if not (folder / "back.ply").is_file():
+        raise SplatFileError(f"{NAME} did not read back what it wrote; another version may (`{INSTALL}`).")
     loss = measure_loss(folder / "back.ply", source, made.mip, move_to_file(source, options))
     (folder / "back.ply").unlink()
     return loss

@@ -12,7 +12,8 @@ from freqgs_plugin.functional.similarity import Similarity
 from freqgs_plugin.io.init_source import frame_of
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.ply import SplatFileError, read_ply
-from freqgs_plugin.io.splat_transform import run_tool
+from freqgs_plugin.io.splat_transform import finest_files, run_tool
+from freqgs_plugin.io.spz import read_antialiased
 
 MANIFEST = "manifest.json"
 _BY_TOOL = (".spz", ".sog")
@@ -67,14 +68,19 @@ def read_exported(path: Path) -> Exported:
             manifest = _manifest(path.parent.parent / MANIFEST)
         with tempfile.TemporaryDirectory() as folder:
             back = Path(folder) / "back.ply"
-            selection = ("-L", "0") if path.name == _STREAMED else ()
-            run_tool("-w", *selection, path.resolve(), back)
+            files = finest_files(path) if path.name == _STREAMED else [path]
+            run_tool("-w", *(file.resolve() for file in files), back)
             gaussians, summary = read_ply(back)
         # a level of detail is no level of ours
-        gaussians = replace(gaussians, level=None)
+        gaussians, antialiased = replace(gaussians, level=None), summary.antialiased
+        if path.suffix == ".spz":
+            antialiased = read_antialiased(path)
+        elif manifest.get("viewer") in ("mip", "classic"):
+            antialiased = manifest["viewer"] == "mip"
     else:
         gaussians, summary = read_ply(path)
-    return Exported(path, gaussians, False, summary.antialiased, manifest.get("frame"), manifest.get("origin", {}))
+        antialiased = summary.antialiased
+    return Exported(path, gaussians, False, antialiased, manifest.get("frame"), manifest.get("origin", {}))
 
 
 def _manifest(path: Path) -> dict[str, Any]:

@@ -1,9 +1,11 @@
 """PlayCanvas's `splat-transform`, where it is installed: SPZ files and streamed SOGs."""
 
+import json
 import shutil
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from freqgs_plugin.io.ply import SplatFileError
 
@@ -45,6 +47,31 @@ def tool_version() -> str:
         return "not installed"
     done = subprocess.run([tool, "--version"], capture_output=True, text=True, timeout=60, check=False)
     return (done.stdout + done.stderr).strip().splitlines()[-1] if (done.stdout + done.stderr).strip() else "unknown"
+
+
+def finest_files(streamed: Path) -> list[Path]:
+    """Of a streamed SOG, the files of its finest level of detail, which the tool reads one by one.
+
+    Args:
+        streamed: its lod-meta.json.
+
+    Raises:
+        SplatFileError: it names no such files.
+    """
+
+    def finest(node: Any) -> set[int]:
+        found = {int(node["lods"]["0"]["file"])} if "0" in node.get("lods", {}) else set()
+        return found.union(*(finest(child) for child in node.get("children", [])))
+
+    try:
+        content = json.loads(streamed.read_text(encoding="utf-8"))
+        files = [streamed.parent / content["filenames"][index] for index in sorted(finest(content["tree"]))]
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
+        raise SplatFileError(f"{streamed} is no streamed SOG, or damaged ({error!r}); export it again.") from error
+    inside = streamed.parent.resolve()
+    if not files or not all(inside in file.resolve().parents and file.is_file() for file in files):
+        raise SplatFileError(f"{streamed} names no files of a finest level beside it; export it again.")
+    return files
 
 
 def streamed_command(prefixes: Sequence[str], output: str) -> list[str]:
