@@ -44,7 +44,12 @@ def scenes_folder():
     return Path(os.environ["FREQGS_SCENES"])
 
 
+LONGEST = ("test_viewer.py", "test_commands.py", "test_export_command.py", "test_trim_command.py", "test_clodsplat.py")
+"""files that take minutes: begun first, so that no process is left alone with one of them"""
+
+
 def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
     if torch.cuda.is_available():
         return
     for item in items:
