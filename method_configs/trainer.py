@@ -3,16 +3,16 @@
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
 from freqgs_plugin.studio.config import FreqSplatModelConfig
 from freqgs_plugin.studio.datamanager import SceneDatamanagerConfig
+from freqgs_plugin.studio.trainer import SplatTrainerConfig
 
 
-def trainer_config(method_name: str, model: FreqSplatModelConfig, optimizers: dict) -> TrainerConfig:
+def trainer_config(method_name: str, model: FreqSplatModelConfig, optimizers: dict) -> SplatTrainerConfig:
     """30,000 steps on full images, of which every eighth is held out; in the viewer; on CUDA where there is one."""
-    return TrainerConfig(
+    return SplatTrainerConfig(
         method_name=method_name,
         steps_per_eval_image=500,
         steps_per_eval_batch=0,

@@ -230,9 +230,7 @@ class Panel(ViewerElement[str]):
         if self.gaze.value == MIDDLE:
             return 0.5, 0.5
         if self.gaze.value == SALIENT:
-            # it imports
-            with uninterrupted():
-                return salient_point(surroundings.base())
+            return salient_point(surroundings.base())
         return self._clicks.here().gaze
 
     def _find_target(self, gaussians: Gaussians) -> None:
@@ -240,20 +238,18 @@ class Panel(ViewerElement[str]):
         places = self._clicks.here()
         if places.ray is None:
             return
-        # it imports
-        with uninterrupted():
-            (origin, direction), places.ray = places.ray, None
-            try:
-                hit = GeometryIndex(gaussians).pick(sight(origin, direction, gaussians.means), (0.5, 0.5))
-            except ValueError as error:
-                self.say("focus", f"Nothing can be picked: {error}")
-                return
-            if hit is None:
-                self.say("focus", "Under the click is nothing of level 1, and the last focus stays.")
-                return
-            x, y, z = hit.point.tolist()
-            places.target = ((x, y, z), hit.depth)
-            self.say("focus", None)
+        (origin, direction), places.ray = places.ray, None
+        try:
+            hit = GeometryIndex(gaussians).pick(sight(origin, direction, gaussians.means), (0.5, 0.5))
+        except ValueError as error:
+            self.say("focus", f"Nothing can be picked: {error}")
+            return
+        if hit is None:
+            self.say("focus", "Under the click is nothing of level 1, and the last focus stays.")
+            return
+        x, y, z = hit.point.tolist()
+        places.target = ((x, y, z), hit.depth)
+        self.say("focus", None)
 
 
 def _choice(name: str, options: list[str], hint: str) -> ViewerDropdown:

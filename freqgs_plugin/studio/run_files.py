@@ -52,7 +52,7 @@ def latest_checkpoint(run: Path) -> tuple[Path, int]:
     if not steps:
         raise FileNotFoundError(f"{folder} holds no step-000000000.ckpt; the run has not saved a checkpoint yet.")
     path = folder / f"step-{max(steps):09d}.ckpt"
-    _check_whole(path)
+    check_whole(path)
     return path, max(steps)
 
 
@@ -79,25 +79,39 @@ def in_one_piece(run: Path) -> Iterator[Path]:
                 path.rmdir()
 
 
-def save_checkpoint(content: dict[str, Any], path: Path, run: Path) -> None:
-    """Write a checkpoint of the run that is going to lie at `run`.
+@contextmanager
+def naming_the_disk(name: str, folder: Path, run: Path, remedy: str) -> Iterator[None]:
+    """torch writes the file `name` into `folder`; it ends up in `run`.
 
     Raises:
         OSError: the disk is full; what torch says of that does not name it.
     """
     try:
-        torch.save(content, path)
-    except RuntimeError as error:
-        free = shutil.disk_usage(path.parent).free
+        yield
+    except (OSError, RuntimeError) as error:
+        free = shutil.disk_usage(folder).free
         reason = str(error).splitlines()[0]
         raise OSError(
-            f"{path.name} cannot be written to {run} ({reason}); {free / 1e6:,.0f} MB are free there. Make room, or "
-            "name another --output-dir."
+            f"{name} cannot be written to {run} ({reason}); {free / 1e6:,.0f} MB are free there. {remedy}"
         ) from error
 
 
-def _check_whole(path: Path) -> None:
-    """By the checksums that torch writes and does not look at: else lost blocks become parameters, mostly zeros."""
+def save_checkpoint(content: dict[str, Any], path: Path, run: Path) -> None:
+    """Write a checkpoint of the run that is going to lie at `run`.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    with naming_the_disk(path.name, path.parent, run, "Make room, or name another --output-dir."):
+        torch.save(content, path)
+
+
+def check_whole(path: Path) -> None:
+    """By the checksums that torch writes and does not look at: else lost blocks become parameters, mostly zeros.
+
+    Raises:
+        ValueError: the file is cut off, or its contents have changed since it was written.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
