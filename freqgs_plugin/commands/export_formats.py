@@ -1,10 +1,13 @@
 """One function per format: it writes into a folder, reads back what it wrote, and tells what that loses."""
 
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from rich.markup import escape
 
 from freqgs_plugin.commands.export_loss import Loss, Written, measure_loss
 from freqgs_plugin.commands.export_options import ExportOptions
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
 PLY, SPZ, LEVELS = "splat.ply", "splat.spz", "levels"
 MANIFEST = "manifest.json"
 STREAMED = "sog/lod-meta.json"
+BACK = "back.ply"
+"""what splat-transform wrote, read back by it"""
 
 
 @dataclass(frozen=True)
@@ -102,19 +107,8 @@ def write_as_levels(source: Source, options: ExportOptions, work: Work) -> list[
     deltas = [_write_delta(source, options, level, folder) for level in range(1, source.levels + 1)]
     written += [delta for delta in deltas if delta is not None]
     names = [f"prefix_{level}.ply" for level in range(1, source.levels + 1)]
-    command = streamed_command(names, STREAMED)
-    note: dict[str, Any] = {"command": [NAME, *command], "ran": False, "tool": tool_version()}
-    if find_tool() is None or not options.sog:
-        work.console.print(f"For PlayCanvas viewers, after `{INSTALL}`, in {LEVELS}/:", soft_wrap=True)
-        work.console.print(f"  {NAME} {' '.join(command)}", soft_wrap=True, highlight=False)
-    else:
-        work.console.print(
-            f"{NAME} makes a streamed SOG; that may take minutes (--no-sog leaves it out) ...", soft_wrap=True
-        )
-        begun = time.perf_counter()
-        run_tool(*command, folder=folder)
-        note["ran"] = True
-        written += _streamed(source, options, prefixes, folder, begun)
+    sog, note = _write_streamed(source, options, prefixes, names, work)
+    written += sog
     work.notes.update(
         levels=source.levels,
         signed_residuals=source.signed,
@@ -177,6 +171,37 @@ def _write_delta(source: Source, options: ExportOptions, level: int, folder: Pat
     return Written(path, len(raw), None, time.perf_counter() - begun, note)
 
 
+def _write_streamed(
+    source: Source, options: ExportOptions, prefixes: list[Plain], names: list[str], work: Work
+) -> tuple[list[Written], dict[str, Any]]:
+    """The streamed SOG, and what the manifest says of it. Where the tool fails or is interrupted, it is left out: what
+    was baked for an hour stays."""
+    folder = work.folder / LEVELS
+    command = streamed_command(names, STREAMED)
+    note: dict[str, Any] = {"command": [NAME, *command], "ran": False, "tool": tool_version()}
+    by_hand = f"  {NAME} {' '.join(command)}"
+    if find_tool() is None or not options.sog:
+        work.console.print(f"For PlayCanvas viewers, after `{INSTALL}`, in {LEVELS}/:", soft_wrap=True)
+        work.console.print(by_hand, soft_wrap=True, highlight=False)
+        return [], note
+    begun = time.perf_counter()
+    try:
+        with work.console.status(f"{NAME} makes a streamed SOG: minutes, without a GPU; Ctrl-C leaves it out ..."):
+            run_tool(*command, folder=folder)
+            made = _streamed(source, options, prefixes, folder, begun)
+    except (SplatFileError, KeyboardInterrupt) as error:
+        shutil.rmtree((folder / STREAMED).parent, ignore_errors=True)
+        (folder / BACK).unlink(missing_ok=True)
+        note["failed"] = str(error) or "interrupted"
+        work.console.print(
+            f"[bold red]The streamed SOG is left out ({escape(note['failed'])}).[/] All else is written; in {LEVELS}/:",
+            soft_wrap=True,
+        )
+        work.console.print(by_hand, soft_wrap=True, highlight=False)
+        return [], note
+    return made, {**note, "ran": True}
+
+
 def _streamed(
     source: Source, options: ExportOptions, prefixes: list[Plain], folder: Path, begun: float
 ) -> list[Written]:
@@ -192,9 +217,9 @@ def _streamed(
 
 def _loss_of(files: list[Path], made: Plain, source: Source, options: ExportOptions, folder: Path) -> Loss:
     """What files of splat-transform's lose, by the PLY that it makes of them."""
-    run_tool("-w", *(file.resolve() for file in files), "back.ply", folder=folder)
-    if not (folder / "back.ply").is_file():
+    run_tool("-w", *(file.resolve() for file in files), BACK, folder=folder)
+    if not (folder / BACK).is_file():
         raise SplatFileError(f"{NAME} did not read back what it wrote; another version may (`{INSTALL}`).")
-    loss = measure_loss(folder / "back.ply", source, made.mip, move_to_file(source, options))
-    (folder / "back.ply").unlink()
+    loss = measure_loss(folder / BACK, source, made.mip, move_to_file(source, options))
+    (folder / BACK).unlink()
     return loss

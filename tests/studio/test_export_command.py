@@ -14,7 +14,7 @@ import torch
 from freqgs_plugin.cli import main
 from freqgs_plugin.commands import export_formats, export_plain
 from freqgs_plugin.io.parameters import GROUPS
-from freqgs_plugin.io.ply import read_ply, write_ply
+from freqgs_plugin.io.ply import SplatFileError, read_ply, write_ply
 from freqgs_plugin.studio.checkpoint import load_run
 
 pytestmark = pytest.mark.slow
@@ -220,6 +220,28 @@ class TestLevels:
     def test_one_level_only(self, faded, tmp_path, refused):
         said = refused("export", "--load-config", faded, "--output-dir", tmp_path, "--format", "levels")
         assert "this scene has one level" in said
+
+    @pytest.mark.parametrize(
+        ("failure", "said"),
+        [(SplatFileError("out of [memory]"), "out of [memory]"), (KeyboardInterrupt(), "interrupted")],
+    )
+    def test_without_the_streamed_sog_all_else_stays(self, plain_run, tmp_path, freqgs, monkeypatch, failure, said):
+        def fails(*arguments, folder):
+            (folder / "sog").mkdir()
+            (folder / "back.ply").write_bytes(b"half of it")
+            raise failure
+
+        monkeypatch.setattr(export_formats, "find_tool", lambda: "splat-transform")
+        monkeypatch.setattr(export_formats, "tool_version", lambda: "3.0")
+        monkeypatch.setattr(export_formats, "run_tool", fails)
+        told = freqgs(
+            "export", "--load-config", plain_run, "--output-dir", tmp_path, "--format", "levels", "--level", 2
+        )
+        assert f"The streamed SOG is left out ({said}). All else is written" in told and "splat-transform -w" in told
+        content = manifest(tmp_path / "levels" / "manifest.json")
+        assert content["streamed_sog"]["failed"] == said and content["streamed_sog"]["ran"] is False
+        assert {path.name for path in (tmp_path / "levels").iterdir()} == {"manifest.json", *content["files"]}
+        assert len(content["files"]) == 4
 
     def test_streamed_sog(self, plain_run, tmp_path, freqgs):
         if export_formats.find_tool() is None:
