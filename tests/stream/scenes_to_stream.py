@@ -1,7 +1,6 @@
 """Small random scenes of several levels, and servers that do what servers should not."""
 
 import threading
-import time
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import ClassVar
@@ -70,8 +69,11 @@ def deaf():
     return Deaf
 
 
-def breaking(after, times, pause=0.0):
-    """Closes the line after so many bytes of the file of chunks and a pause, so many times."""
+def breaking(after, times, wait=lambda: None):
+    """Closes the line after so many bytes of the file of chunks, and `wait()`, so many times.
+
+    What was sent and not read yet may be lost with the line.
+    """
 
     class Breaking(Recording):
         asked: ClassVar[list] = []
@@ -83,7 +85,7 @@ def breaking(after, times, pause=0.0):
             type(self).left -= 1
             super()._send(stream, min(after, count))
             self.wfile.flush()
-            time.sleep(pause)
+            wait()
             self.close_connection = True
             self.connection.shutdown(2)
 

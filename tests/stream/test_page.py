@@ -1,6 +1,7 @@
 """The page in a real browser: its pictures are ours, its controls do what they say, and little stops it."""
 
 import re
+import threading
 from dataclasses import replace
 
 import pytest
@@ -157,12 +158,17 @@ def whole(page, stream):
 
 def test_broken_lines_damage_and_deaf_servers(visit, stream):
     _, manifest, _ = stream
-    handlers = [breaking(manifest.chunks[4].offset + 7, 1, 0.3), damaging(manifest.chunks[2].offset + 3, 1), deaf()]
-    for handler in handlers:
+    read = threading.Event()
+    handler = breaking(manifest.chunks[4].offset + 7, 1, lambda: read.wait(60))
+    page = visit(handler)
+    page.until("freqgs.received?.chunks === 4")
+    read.set()
+    assert whole(page, stream) and not page.tell("freqgs.problem")
+    asked = [range_ for path, range_ in handler.asked if path.endswith(".bin")]
+    assert len(asked) == 2 and asked[1].startswith(f"bytes={manifest.chunks[4].offset}-")
+    for handler in (damaging(manifest.chunks[2].offset + 3, 1), deaf()):
         page = visit(handler)
         assert whole(page, stream) and not page.tell("freqgs.problem"), handler
-    asked = [range_ for path, range_ in handlers[0].asked if path.endswith(".bin")]
-    assert len(asked) == 2 and asked[1].startswith(f"bytes={manifest.chunks[4].offset}-")
 
 
 def test_what_stays_damaged_is_reported_and_the_rest_shown(visit, stream):
