@@ -174,8 +174,7 @@ def _write_delta(source: Source, options: ExportOptions, level: int, folder: Pat
 def _write_streamed(
     source: Source, options: ExportOptions, prefixes: list[Plain], names: list[str], work: Work
 ) -> tuple[list[Written], dict[str, Any]]:
-    """The streamed SOG, and what the manifest says of it. Where the tool fails or is interrupted, it is left out: what
-    was baked for an hour stays."""
+    """The streamed SOG, and what the manifest says of it. A tool that fails or is interrupted costs nothing else."""
     folder = work.folder / LEVELS
     command = streamed_command(names, STREAMED)
     note: dict[str, Any] = {"command": [NAME, *command], "ran": False, "tool": tool_version()}
@@ -184,9 +183,10 @@ def _write_streamed(
         work.console.print(f"For PlayCanvas viewers, after `{INSTALL}`, in {LEVELS}/:", soft_wrap=True)
         work.console.print(by_hand, soft_wrap=True, highlight=False)
         return [], note
+    work.console.print(f"{NAME} makes a streamed SOG, which may take long; Ctrl-C leaves it out.", soft_wrap=True)
     begun = time.perf_counter()
     try:
-        with work.console.status(f"{NAME} makes a streamed SOG: minutes, without a GPU; Ctrl-C leaves it out ..."):
+        with work.console.status("clustering harmonics ..."):
             run_tool(*command, folder=folder)
             made = _streamed(source, options, prefixes, folder, begun)
     except (SplatFileError, KeyboardInterrupt) as error:
