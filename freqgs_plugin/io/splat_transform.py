@@ -75,8 +75,11 @@ def finest_files(streamed: Path) -> list[Path]:
 
 
 def streamed_command(prefixes: Sequence[str], output: str) -> list[str]:
-    """Arguments that turn complete scenes, the coarsest first, into one streamed SOG, whose level 0 is the finest."""
-    arguments = ["-w", "-g", "cpu"]
+    """Arguments that turn complete scenes, the coarsest first, into one streamed SOG, whose level 0 is the finest.
+
+    One round of clustering the harmonics: on a CPU the tool's ten were not done with 54,000 Gaussians in half an hour.
+    """
+    arguments = ["-w", "-g", "cpu", "-i", "1"]
     for lod, name in enumerate(reversed(prefixes)):
         arguments += [name, "-l", str(lod)]
     return [*arguments, output]
