@@ -18,6 +18,7 @@ from freqgs_plugin.studio.cameras import to_camera
 from freqgs_plugin.studio.model import FreqSplatModel
 from freqgs_plugin.studio.run_files import latest_checkpoint, read_config
 from freqgs_plugin.studio.view_names import view_names
+from freqgs_plugin.training.choose_levels import said_of_levels
 from freqgs_plugin.types import Camera, Gaussians
 
 
@@ -78,6 +79,10 @@ class Run:
     def num_levels(self) -> int:
         """Levels L of the scene."""
         return self.model.num_levels
+
+    def levels_left_out(self) -> list[str]:
+        """What the run's log said on its number of levels; empty where that was given."""
+        return said_of_levels(self.model.level_choice())
 
     @property
     def scene_distance(self) -> float | None:

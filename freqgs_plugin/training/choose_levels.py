@@ -1,6 +1,6 @@
 """How many levels a scene needs: by the energy of its photographs' Laplacian bands."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,7 +45,7 @@ class LevelChoice:
         return f"{self.levels} level{'s' if self.levels > 1 else ''} ({limit}). {bands}."
 
     @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "LevelChoice":
+    def from_state(cls, state: Mapping[str, Any]) -> "LevelChoice":
         """What `state` was made of; other keys are passed over."""
         width, height = state["size"]
         return cls(state["levels"], state["energies"], state["kept"], state["bound"], (width, height))
@@ -59,6 +59,12 @@ class LevelChoice:
             "bound": self.bound,
             "size": list(self.size),
         }
+
+
+def said_of_levels(choice: Mapping[str, Any]) -> list[str]:
+    """What a run's log said on its number of levels, from `level_choice` in its checkpoint; none where it was given."""
+    said = [LevelChoice.from_state(choice).text()] if "levels" in choice else []
+    return [*said, *([choice["stopped"]] if "stopped" in choice else [])]
 
 
 def choose_levels(images: Iterable[Float[Tensor, "_ _ 3"]], psnr: float | int, share: float | int) -> LevelChoice:

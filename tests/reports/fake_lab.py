@@ -26,15 +26,17 @@ def decaying_run(decay=2.0, n=60, views=2):
         run.gaussians = replace(run.gaussians, decay=decay * spread)
     run.scene_distance = None if decay is None else 2.5
     held_out = fake_views(views)
-    return SimpleNamespace(**vars(run), cameras=lambda split: held_out)
+    return SimpleNamespace(**vars(run), cameras=lambda split: held_out, levels_left_out=list)
 
 
-def levels_run(n=60, views=2):
-    """A `LoadedRun` of three levels, without decay."""
+def levels_run(n=60, views=2, said=()):
+    """A `LoadedRun` of three levels, without decay, that says so much of its levels."""
     run = fake_run(levels=3, n=n)
     run.rasterizer = get_rasterizer("numba", "cpu")
     held_out = fake_views(views)
-    return SimpleNamespace(**vars(run), scene_distance=None, cameras=lambda split: held_out)
+    return SimpleNamespace(
+        **vars(run), scene_distance=None, cameras=lambda split: held_out, levels_left_out=lambda: list(said)
+    )
 
 
 class FakeTools:
@@ -59,8 +61,8 @@ class FakeTools:
     def load(self, path):
         self.loaded.append(path)
         said = json.loads(path.read_text())
-        if said["method"].startswith("lapsplat") and "num_levels" not in said:
-            return levels_run()
+        if said["method"].startswith("lapsplat") and said.get("num_levels") in (None, "auto", 5):
+            return levels_run(said=[f"chosen by {said}"] if said.get("num_levels") == "auto" else ())
         decays = said["method"].startswith("clodsplat") and said.get("use_decay", True)
         return decaying_run(said.get("largest_scale", 5.0) if decays else None)
 
@@ -68,6 +70,7 @@ class FakeTools:
         ours = {"largest_scale": 5.0, "use_decay": True, "weigh_scales": True, "reg_weight": 1.0, "reg_gradient": "ste"}
         levels = {"dft_weight": 0.001, "lower_level_weight": 0.1, "signed_residuals": True}
         levels |= {"num_levels": 3, "base_share": 1.0, "level_interval": 2500, "coarse_growth_factor": 1.8}
+        levels |= {"least_level_gain": 0.0}
         more = ours if method.startswith("clodsplat") else {**PLAIN, **levels}
         fields = {"seed": 42, "max_gaussians": 0, **more}
         return {name: repr(value) for name, value in {**fields, **self.changed}.items()}

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from fake_lab import SCENE, FakeTools, levels_run
 
 from freqgs_plugin.reports.bench.options import BenchError
-from freqgs_plugin.reports.experiments import claims, claims_goals, claims_measures
+from freqgs_plugin.reports.experiments import claims, claims_goals, claims_levels, claims_measures
 from freqgs_plugin.reports.experiments.claims import CLAIMS, RUNS, training_of
 from freqgs_plugin.reports.experiments.claims_runner import run_claims
 from freqgs_plugin.reports.experiments.options import ClaimsOptions, ExperimentError
@@ -77,7 +77,7 @@ def test_all_claims_are_measured_once_and_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(claims_measures, "FOVEATED_SIZE", (48, 32))
     docs = tmp_path / "docs" / "claims.md"
     docs.parent.mkdir()
-    names = ("claims-A", "claims-B", "goals", "runs")
+    names = ("claims-A", "claims-B", "goals", "runs", "levels")
     places = (f"<!-- {name} room -->\n<!-- end of {name} room -->\n" for name in names)
     docs.write_text("# Claims\n\n<!-- claims-A hall -->\nkept\n" + "".join(places))
     options = ClaimsOptions(
@@ -88,18 +88,19 @@ def test_all_claims_are_measured_once_and_shown(tmp_path, monkeypatch):
     with pytest.raises(ExperimentError, match="nothing finished"):
         run_claims(ClaimsOptions(**{**vars(options), "page_only": True}), [SCENE], tools.tools(), console)
     found = run_claims(options, [SCENE], tools.tools(), console)
-    assert {name for name, results in found["room"][1].items() if results} == {*BY_NAME, "goals", "runs"}
-    # 9 of the table of runs, 2 of one size, s_max 1, plain's coarse sibling, without w_s, without L_reg
-    assert len(tools.trained) == 9 + 2 + 4
+    assert {name for name, results in found["room"][1].items() if results} == {*BY_NAME, "goals", "runs", "levels"}
+    # 9 of the table of runs, 2 of one size, s_max 1, plain's coarse sibling, without w_s, without L_reg, 3 of levels
+    assert len(tools.trained) == 9 + 2 + 4 + 3
     assert len(tools.trained) == len({str(training) for training in tools.trained})
     page = docs.read_text(encoding="utf-8")
     whole = (tmp_path / "out" / "claims.md").read_text(encoding="utf-8")
     tables = [part for part in whole.split("## room")[1].strip().split("\n\n") if part.startswith("|")]
-    assert len(tables) == 4 and all(table in page for table in tables) and "<!-- claims-A hall -->\nkept" in page
+    assert len(tables) == 5 and all(table in page for table in tables) and "<!-- claims-A hall -->\nkept" in page
     for claim in CLAIMS:
         (row,) = (line for line in page.splitlines() if line.startswith(f"| {claim.name} "))
         assert row.endswith(("| holds |", "| does not hold |")) and claim.paper in row
-    assert all(f"| {name} |" in page for name in RUNS)
+    assert all(f"| {name} |" in page for name in (*RUNS, *claims_levels.CHOICES))
+    assert "* auto: chosen by {'method': 'lapsplat', 'num_levels': 'auto'}" in page
     assert "| lapsplat, prefix 2: at most 1 dB under a plain model of its size |" in page
     again = FakeTools(tmp_path / "runs")
     run_claims(options, [SCENE], again.tools(), console)
@@ -178,3 +179,17 @@ def test_a_model_of_one_size_is_judged_at_that_size():
     assert whole["small"] == pytest.approx(whole["reduced"]) and found["small"] != pytest.approx(whole["small"])
     training = claims_goals.alone(Trial(SCENE, 30, 42), 1)
     assert training.options["num_levels"] == 3 and training.options["coarse_growth_factor"] == 1.0
+
+
+def test_levels_are_shown_with_their_bytes_and_what_the_run_said():
+    runs = {
+        name: {**run_of(psnr=25.0 + i, gaussians=1000 * i, ssim=0.5), "bytes": 236_000 * i, "said": []}
+        for i, name in enumerate(claims_levels.CHOICES, 1)
+    }
+    runs["auto"]["said"] = ["2 levels."]
+    times = {name: {"median_ms": 10.0 * i} for i, name in enumerate(runs, 1)}
+    page = claims_levels.text("room", [{"runs": runs, "times": times}])
+    assert "| auto | 27.00 | 0.500 | 2,000 | 0.47 | 20.0 | 50 / 30 / 20 |" in page
+    assert page.endswith("* auto: 2 levels.")
+    # 14 numbers of every Gaussian, 3 of each of 3 further harmonics; all float32
+    assert claims_levels.chosen(levels_run(said=["why"])) == {"bytes": 60 * 4 * (14 + 9), "said": ["why"]}

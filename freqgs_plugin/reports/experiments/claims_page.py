@@ -5,7 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from freqgs_plugin.reports.bench.tables import BenchTable, Row
-from freqgs_plugin.reports.experiments import claims_goals
+from freqgs_plugin.reports.experiments import claims_goals, claims_levels
 from freqgs_plugin.reports.experiments.claims import CLAIMS, RUNS
 from freqgs_plugin.reports.experiments.goals import Goal, goal_markdown, summary
 from freqgs_plugin.reports.experiments.page import circumstances
@@ -13,7 +13,7 @@ from freqgs_plugin.reports.experiments.section import Results
 from freqgs_plugin.reports.experiments.seeds import shown
 
 Found = Mapping[str, list[dict[str, Any]]]
-"""claim, "goals" or "runs" -> what was measured in one scene, one per finished seed"""
+"""claim, "goals", "runs" or "levels" -> what was measured in one scene, one per finished seed"""
 INTRODUCTION = """\
 What the two papers claim, each put to the test on the same scenes in the same run. *A* is the paper on frequency-aware
 decomposition (`lapsplat`), *B* the one on continuous level of detail (`clodsplat`). *plain* is the same code with one
@@ -35,8 +35,8 @@ def places(scene: str, record: Mapping[str, Any], found: Found) -> dict[str, str
 
 
 def place_of(name: str) -> str:
-    """The place of a claim, of "goals" or "runs": what one paper claims stands together."""
-    return name if name in ("goals", "runs") else f"claims-{name[0]}"
+    """The place of a claim, of "goals", "runs" or "levels": what one paper claims stands together."""
+    return name if name in ("goals", "runs", "levels") else f"claims-{name[0]}"
 
 
 def _texts(scene: str, found: Found) -> dict[str, str]:
@@ -46,6 +46,7 @@ def _texts(scene: str, found: Found) -> dict[str, str]:
         **{place: claims_text(scene, found, place) for place in papers},
         "goals": goals_text(scene, found),
         "runs": runs_text(scene, found),
+        "levels": claims_levels.text(scene, found["levels"]) if found["levels"] else "",
     }
 
 

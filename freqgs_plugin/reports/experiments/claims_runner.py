@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from freqgs_plugin.reports.bench.page import check_places, fill
 from freqgs_plugin.reports.bench.runner import check_folder, write_all
-from freqgs_plugin.reports.experiments import claims_goals
+from freqgs_plugin.reports.experiments import claims_goals, claims_levels
 from freqgs_plugin.reports.experiments.claims import CLAIMS, RUNS, of_runs
 from freqgs_plugin.reports.experiments.claims_page import (
     Found,
@@ -35,6 +35,7 @@ MEASURED: Mapping[str, Callable[[Lab, Trial, TrialOptions], dict[str, Any]]] = {
     **{claim.name: claim.measure for claim in CLAIMS},
     "goals": claims_goals.measure,
     "runs": of_runs(*RUNS),
+    "levels": claims_levels.measure,
 }
 """all that is measured for each scene and seed"""
 Scenes = Mapping[str, tuple[Mapping[str, Any], Found]]

@@ -87,11 +87,11 @@ class ClaimsOptions(TrialOptions):
     """folder for trained runs, finished steps, claims.json and claims.md; a second start goes on from there. A folder
     of `freqgs experiment clod` serves as well: what it holds is not done again"""
     only: tuple[str, ...] = ()
-    """what to measure: A-a, A-b ... B-d, goals, runs, with spaces or commas between; without it everything. What else
-    the folder holds is shown as well"""
+    """what to measure: A-a, A-b ... B-d, goals, runs, levels, with spaces or commas between; without it everything.
+    What else the folder holds is shown as well"""
     docs: Path | None = None
     """page in which each scene's tables are filled in, between the comments <!-- claims-A SCENE -->, <!-- claims-B
-    SCENE -->, <!-- goals SCENE -->, <!-- runs SCENE --> and their ends"""
+    SCENE -->, <!-- goals SCENE -->, <!-- runs SCENE -->, <!-- levels SCENE --> and their ends"""
 
 
 def command_line(options: TrialOptions, experiment: str) -> str:

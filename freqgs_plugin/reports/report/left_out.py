@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from freqgs_plugin.training.choose_levels import LevelChoice
+from freqgs_plugin.training.choose_levels import said_of_levels
 
 TRIMMED = "trim.json"
 """what `freqgs trim` leaves in the folder of a run that it wrote"""
@@ -20,11 +20,7 @@ def left_out(choice: dict[str, Any], folder: Path) -> list[dict[str, str]]:
     Raises:
         ValueError: its trim.json is damaged.
     """
-    rows = []
-    if "levels" in choice:
-        rows.append(_row("levels", LevelChoice.from_state(choice).text()))
-    if "stopped" in choice:
-        rows.append(_row("levels", choice["stopped"]))
+    rows = [_row("levels", text) for text in said_of_levels(choice)]
     file = folder / TRIMMED
     if file.is_file():
         rows += _trimmed(file)
