@@ -1,24 +1,46 @@
-"""A small scene, a run that the real `ns-train` made of it, and trainers to be stepped by hand."""
+"""A small scene, runs that the real `ns-train` made of it, and trainers to be stepped by hand."""
 
 import copy
+import os
 import shutil
 from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock
 from running import DECAY_START, EVERY, SCALE, SIZE, STEPS, command, train_arguments
 
 from freqgs_plugin.demo.dataset import SceneOptions, write_scene
 
 
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory):
+def shared(tmp_path_factory):
+    """`shared(name, make)`: a folder that `make(folder)` fills, once for all processes of this test run.
+
+    The first process that asks makes it, others wait. Nobody else writes into it.
+    """
+    root = tmp_path_factory.getbasetemp()
+    # a process of pytest-xdist has a folder of its own in that of the test run
+    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+
+    def once(name, make):
+        folder, done = root / f"shared-{name}", root / f"shared-{name}.done"
+        with FileLock(root / f"shared-{name}.lock"):
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                done.touch()
+        return folder
+
+    return once
+
+
+@pytest.fixture(scope="session")
+def scene(shared):
     """Nine views, of which three are held out; nobody writes into it."""
-    folder = tmp_path_factory.mktemp("scene") / "scene"
-    write_scene(
-        folder, SceneOptions(num_views=9, width=SIZE[0], height=SIZE[1], num_points=300, samples=1), progress=False
-    )
-    return folder
+    options = SceneOptions(num_views=9, width=SIZE[0], height=SIZE[1], num_points=300, samples=1)
+    return shared("scene", lambda folder: write_scene(folder / "scene", options, progress=False)) / "scene"
 
 
 @pytest.fixture
@@ -28,32 +50,29 @@ def own_scene(scene, tmp_path):
 
 
 @pytest.fixture(scope="session")
-def trained(scene, tmp_path_factory):
-    """config.yml of a finished run of three levels, with the checkpoints of every stage."""
-    output = tmp_path_factory.mktemp("runs")
-    done = command(
-        "ns-train",
-        *train_arguments(
-            scene, output, "--max-num-iterations", STEPS, "--steps-per-save", 25, "--save-only-latest-checkpoint", False
-        ),
-    )
-    config = output / "small" / "lapsplat" / "run" / "config.yml"
-    assert done.code == 0 and config.is_file(), str(done)
-    (config.parent / "log.txt").write_text(done.text)
-    return config
+def trained(scene, shared):
+    """config.yml of a finished run of three levels, with the checkpoints of every stage; nobody writes beside it."""
+    return run_of("lapsplat", scene, shared)
 
 
 @pytest.fixture(scope="session")
-def faded(scene, tmp_path_factory):
+def faded(scene, shared):
     """config.yml of a finished run of clodsplat, with a checkpoint from before its decay begins and some from after."""
-    output = tmp_path_factory.mktemp("runs")
-    more = ["--max-num-iterations", STEPS, "--steps-per-save", 25, "--save-only-latest-checkpoint", False]
-    more += ["--pipeline.model.decay-start-step", round(DECAY_START / SCALE), "--pipeline.model.export-distance", 0.6]
-    done = command("ns-train", *train_arguments(scene, output, *more, method="clodsplat"))
-    config = output / "small" / "clodsplat" / "run" / "config.yml"
-    assert done.code == 0 and config.is_file(), str(done)
-    (config.parent / "log.txt").write_text(done.text)
-    return config
+    more = ["--pipeline.model.decay-start-step", round(DECAY_START / SCALE), "--pipeline.model.export-distance", 0.6]
+    return run_of("clodsplat", scene, shared, *more)
+
+
+def run_of(method, scene, shared, *more):
+    """config.yml of a run with checkpoints of every 25 steps, and `log.txt` beside it."""
+    every = ("--max-num-iterations", STEPS, "--steps-per-save", 25, "--save-only-latest-checkpoint", False)
+    place = Path("small", method, "run", "config.yml")
+
+    def make(output):
+        done = command("ns-train", *train_arguments(scene, output, *every, *more, method=method))
+        assert done.code == 0 and (output / place).is_file(), str(done)
+        (output / place).with_name("log.txt").write_text(done.text)
+
+    return shared(method, make) / place
 
 
 @pytest.fixture
