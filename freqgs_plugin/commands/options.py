@@ -39,7 +39,7 @@ class RenderOptions:
     """how fast detail falls off beyond, share of the longer side"""
     gaze_scale: int | None = None
     """how many times smaller the picture outside of the fovea is drawn, and enlarged; 1: at full size; without it the
-    most, up to 4, that leaves it 960 px on the longer side"""
+    most of 4, 2 and 1 that leaves it 960 px on the longer side"""
     focus: str | None = None
     """all levels for one object: a folder of masks, VIEW:left,top,right,bottom or VIEW:x,y (pixels, grown by GrabCut),
     or text:PROMPT (needs the extra `prompt`)"""

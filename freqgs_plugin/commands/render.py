@@ -186,7 +186,7 @@ def _decay(scene: Scene, detail: float | None, count: int | None) -> Attenuation
     reference = "frustum_max" if scene.scene_distance is None else "scene"
     least = 1.0 if detail is None else detail
     if count is not None:
-        return DecayBudget(count, reference, scene.scene_distance, least=least)
+        return DecayBudget(count, reference, scene.scene_distance, least=least, largest=scene.largest_scale)
     return DistanceDecay(least, reference, scene.scene_distance)
 
 

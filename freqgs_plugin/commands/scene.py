@@ -14,6 +14,8 @@ from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
 from freqgs_plugin.reports.bench.trained import load, views_of_split
 from freqgs_plugin.types import Camera, Gaussians
 
+LARGEST_SCALE = 5.0
+"""`largest-scale` of clodsplat, if not told otherwise"""
 MOST_PIXELS = 1 << 28
 """of a picture: 16384 x 16384, for which about 10 GB of memory are taken"""
 
@@ -30,6 +32,12 @@ class Scene:
     """what decay divides distances by, world units; None: not known"""
     run: Any = None
     """`studio.checkpoint.Run`; None for a file alone"""
+
+    @property
+    def largest_scale(self) -> float:
+        """The largest distance scale that decays were trained for; of a file alone that is not known: the default's."""
+        trained = None if self.run is None else self.run.largest_scale
+        return LARGEST_SCALE if trained is None else trained
 
 
 def open_scene(load_config: Path | None, ply: Path | None, rasterizer: str) -> Scene:

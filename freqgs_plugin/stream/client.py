@@ -67,7 +67,11 @@ class Patience:
 
 
 def fetch(
-    source: str | Path, *, folder: Path | None = None, patience: Patience | None = None, arrived: Arrived | None = None
+    source: str | Path,
+    *,
+    folder: str | Path | None = None,
+    patience: Patience | None = None,
+    arrived: Arrived | None = None,
 ) -> Fetched:
     """Fetch a stream from the URL or path of its folder.
 
@@ -81,7 +85,7 @@ def fetch(
     text = _patiently(line, patience)
     manifest = parse_manifest(text, f"{source}/{MANIFEST}")
     fetched = Fetched(Received(manifest), bytes=len(text))
-    store = None if folder is None else _Store(folder, manifest)
+    store = None if folder is None else _Store(Path(folder), manifest)
     missing = list(range(len(manifest.chunks)))
     if store is not None:
         for index, data in store.kept():

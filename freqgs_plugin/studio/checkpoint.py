@@ -90,6 +90,11 @@ class Run:
         return getattr(self.model, "scene_distance", None)
 
     @property
+    def largest_scale(self) -> float | None:
+        """The largest distance scale that its decays were trained for; None without decay."""
+        return getattr(self.model.config, "largest_scale", None)
+
+    @property
     def background(self) -> Float[Tensor, " 3"]:
         """What lies behind everything."""
         return self.model.background_color.to(self.model.device)

@@ -18,7 +18,6 @@ from freqgs_plugin.studio.checkpoint import Run
 from freqgs_plugin.studio.run_files import CHECKPOINTS, in_one_piece, save_checkpoint
 
 _MODEL = "_model."
-_STATE = f"{_MODEL}_extra_state"
 
 
 def check_place(folder: Path, method: str) -> None:

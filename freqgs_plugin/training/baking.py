@@ -59,8 +59,6 @@ class BakeOptions:
 
     steps: int = 400
     seed: int = 0
-    shapes: bool = True
-    """centres, scales and rotations learn, too, not only colours and opacities"""
     small: float = _SMALL
     """share of the steps, the first ones, that draw pictures of half the size"""
 
@@ -176,8 +174,6 @@ class _Learning:
             "features_rest": start.features_rest,
         }
         rates = {**_RATES, "means": _MEANS_RATE * near}
-        if not options.shapes:
-            rates = {**rates, "means": 0.0, "scales": 0.0, "quats": 0.0}
         self._raw = {name: value.detach().clone().requires_grad_(rates[name] > 0) for name, value in raw.items()}
         groups = [{"params": [self._raw[name]], "lr": 0.0, "rate": rate} for name, rate in rates.items() if rate > 0]
         self._optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)

@@ -13,9 +13,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from fake_lab import SCENE, FakeTools, levels_run
 
 from freqgs_plugin.reports.bench.options import BenchError
+from freqgs_plugin.reports.bench.page import check_places
 from freqgs_plugin.reports.experiments import claims, claims_goals, claims_levels, claims_measures
 from freqgs_plugin.reports.experiments.claims import CLAIMS, RUNS, training_of
-from freqgs_plugin.reports.experiments.claims_runner import run_claims
+from freqgs_plugin.reports.experiments.claims_page import claims_text, finished_of, place_of
+from freqgs_plugin.reports.experiments.claims_runner import MEASURED, run_claims
 from freqgs_plugin.reports.experiments.options import ClaimsOptions, ExperimentError
 from freqgs_plugin.reports.experiments.training import Trial
 
@@ -134,6 +136,22 @@ def test_a_page_without_a_scenes_place_is_refused_before_anything_is_trained(tmp
         with pytest.raises(BenchError, match=f"<!-- {missing} -->"):
             run_claims(options, [SCENE], tools.tools(), console)
     assert tools.trained == [] and not (tmp_path / "out").exists()
+
+
+def test_the_page_of_the_documentation_has_every_place():
+    page = Path(__file__).parents[2] / "docs" / "claims.md"
+    names = [f"{place_of(name)} {scene}" for scene in ("banana", "brighton_beach", "demo") for name in MEASURED]
+    check_places(page.read_text(encoding="utf-8"), names, page)
+
+
+def test_a_row_of_fewer_seeds_says_so():
+    two = {"plain": run_of(), "clodsplat-paper": run_of(), "clodsplat": run_of()}
+    found = {name: [] for name in MEASURED} | {"B-a": [two], "B-c": []}
+    (row,) = [line for line in claims_text("room", found, "claims-B", 2).splitlines() if line.startswith("| B-a")]
+    assert "(1 of 2 seeds) | does not hold |" in row
+    for count, seeds in ((2, 2), (1, 1)):
+        assert "seeds)" not in claims_text("room", {**found, "B-a": [two] * count}, "claims-B", seeds)
+    assert finished_of(0, 2) == "" and finished_of(1, 2) == "1 of 2 seeds"
 
 
 def test_the_papers_settings_are_those_of_the_registered_method():

@@ -79,7 +79,7 @@ def test_a_line_that_stays_broken_is_reported_and_resumed(stream, expected, tmp_
         fetched = fetch(server.url, folder=tmp_path, patience=SOON)
     assert fetched.resumed >= manifest.chunks[2].offset and same(fetched, expected)
     assert sorted(p.name for p in tmp_path.iterdir()) == [MANIFEST, manifest.data]
-    again = fetch(tmp_path, folder=tmp_path)
+    again = fetch(str(tmp_path), folder=str(tmp_path))
     assert again.resumed == manifest.bytes
 
 

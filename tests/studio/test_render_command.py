@@ -1,7 +1,9 @@
 """`freqgs render` on trained runs, as a user calls it."""
 
 import json
+import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from freqgs_plugin.apps.foveation import Foveation
 from freqgs_plugin.apps.rescaled import render_rescaled
 from freqgs_plugin.cli import main
 from freqgs_plugin.commands.scene import resized
+from freqgs_plugin.functional.budget import DecayBudget
 from freqgs_plugin.io.images import read_image, to_uint8, write_image
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.ply import write_ply
@@ -129,6 +132,21 @@ def test_detail_and_time_of_a_scene_with_decay(faded, tmp_path, render):
         change = read_image(tmp_path / "far" / f"{name}.png") != read_image(tmp_path / "all" / f"{name}.png")
         assert change.mean() > 0.1
     assert "measured here:" in text
+
+
+def test_a_budget_holds_the_scale_that_decays_were_trained_for(faded, tmp_path, render):
+    """Beyond it everything fades; what shows most stays instead, as in the viewer."""
+    run = load_run(faded)
+    view = run.cameras("test")[0]
+    render("--load-config", faded, "--output-dir", tmp_path / "few", "--budget", 40)
+    held = DecayBudget(40, "scene", run.scene_distance, largest=run.largest_scale)
+    with torch.no_grad():
+        expected = to_uint8(run.model.draw(run.gaussians, view.camera, run.background, held).features.numpy())
+        free = to_uint8(
+            run.model.draw(run.gaussians, view.camera, run.background, replace(held, largest=math.inf)).features.numpy()
+        )
+    shown = read_image(tmp_path / "few" / f"{Path(view.name).stem}.png").astype(int)
+    assert np.abs(shown - expected).max() <= 1 < np.abs(shown - free).max()
 
 
 def test_a_ply_along_a_path(trained, tmp_path, render):

@@ -30,7 +30,7 @@ RUNS_NOTE = (
 
 def places(scene: str, record: Mapping[str, Any], found: Found) -> dict[str, str]:
     """What fills a page: the name of each place -> Markdown; of what is wholly missing there is no place."""
-    texts = _texts(scene, found)
+    texts = _texts(scene, found, len(record["seeds"]))
     return {f"{name} {scene}": f"{_circumstances(record)}\n\n{text}\n" for name, text in texts.items() if text}
 
 
@@ -39,15 +39,24 @@ def place_of(name: str) -> str:
     return name if name in ("goals", "runs", "levels") else f"claims-{name[0]}"
 
 
-def _texts(scene: str, found: Found) -> dict[str, str]:
-    """Place -> Markdown; empty where nothing of it was measured."""
+def _texts(scene: str, found: Found, seeds: int) -> dict[str, str]:
+    """Place -> Markdown, where `seeds` were asked for; empty where nothing of it was measured."""
     papers = dict.fromkeys(place_of(claim.name) for claim in CLAIMS)
-    return {
-        **{place: claims_text(scene, found, place) for place in papers},
+    tables = {
         "goals": goals_text(scene, found),
         "runs": runs_text(scene, found),
         "levels": claims_levels.text(scene, found["levels"]) if found["levels"] else "",
     }
+    missing = {name: finished_of(len(found[name]), seeds) for name, text in tables.items() if text}
+    return {
+        **{place: claims_text(scene, found, place, seeds) for place in papers},
+        **{name: f"Of {missing[name]}.\n\n{text}" if missing.get(name) else text for name, text in tables.items()},
+    }
+
+
+def finished_of(count: int, seeds: int) -> str:
+    """How many seeds a figure is of; empty where that is all of them."""
+    return "" if count in (0, seeds) else f"{count} of {seeds} seeds"
 
 
 def verdicts(scene: str, found: Found) -> list[Row]:
@@ -115,9 +124,11 @@ def run_table(scene: str, results: Results) -> BenchTable:
     return BenchTable(f"claims-{scene}", scene, rows, columns, RUNS_NOTE)
 
 
-def claims_text(scene: str, found: Found, place: str) -> str:
-    """The claims of one paper."""
+def claims_text(scene: str, found: Found, place: str, seeds: int) -> str:
+    """The claims of one paper; a row of fewer than `seeds` says so."""
     rows = [row for row in verdicts(scene, found) if place_of(row["claim"].name) == place]
+    fewer = {row["claim"].name: finished_of(len(found[row["claim"].name]), seeds) for row in rows}
+    rows = [{**row, "found": f"{row['found']} ({few})"} if (few := fewer[row["claim"].name]) else row for row in rows]
     judged = [row["holds"] for row in rows if row["holds"] is not None]
     if not judged:
         return ""
@@ -152,5 +163,9 @@ def markdown_page(scenes: Mapping[str, tuple[Mapping[str, Any], Found]]) -> str:
     """All scenes, each with its record."""
     parts = ["# The papers' claims", INTRODUCTION, claims_goals.INTRODUCTION]
     for scene, (record, found) in scenes.items():
-        parts += [f"## {scene}", _circumstances(record), *(text for text in _texts(scene, found).values() if text)]
+        parts += [f"## {scene}", _circumstances(record), *_shown(scene, found, len(record["seeds"]))]
     return "\n\n".join(parts) + "\n"
+
+
+def _shown(scene: str, found: Found, seeds: int) -> list[str]:
+    return [text for text in _texts(scene, found, seeds).values() if text]
