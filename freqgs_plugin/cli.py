@@ -180,10 +180,14 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point. Errors that name their remedy are printed without a traceback; the exit status is then 1."""
     import tyro
 
+    from freqgs_plugin.reports.child import ended_by_exception
+
     try:
-        tyro.cli(
-            _one_of(COMMANDS), prog="freqgs", description="Level of detail for Gaussian splatting.", args=arguments
-        )
+        # what is half written is removed, as with Ctrl-C
+        with ended_by_exception():
+            tyro.cli(
+                _one_of(COMMANDS), prog="freqgs", description="Level of detail for Gaussian splatting.", args=arguments
+            )
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:

@@ -102,3 +102,30 @@ def test_demo_from_end_to_end(tmp_path, capsys):
     assert (out / "contact_sheet.png").stat().st_size > 5000
     assert "training level 2 of 2" not in (out / "train.log").read_text()
     assert "levels" in capsys.readouterr().out
+
+
+def test_sigterm_leaves_nothing_half_written(tmp_path):
+    """As a system that shuts down sends it: what was there stays, and nothing is left beside it."""
+    code = f"""
+import os, signal
+from pathlib import Path
+from freqgs_plugin import cli
+from freqgs_plugin.reports.report import folder
+
+def interrupted(path, contents, write=folder._write):
+    write(path, contents)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+def command() -> None:
+    out = Path({str(tmp_path / "out")!r})
+    folder.write_folder(out, {{"report.json": b'{{"files": ["a.txt"]}}', "a.txt": b"first"}})
+    folder._write = interrupted
+    folder.write_folder(out, {{"report.json": b"{{}}", "a.txt": b"second"}})
+
+cli.COMMANDS = {{"one": command, "two": command}}
+cli.main(["one"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 143, done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert (tmp_path / "out" / "a.txt").read_text() == "first"

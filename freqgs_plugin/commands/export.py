@@ -13,7 +13,7 @@ from freqgs_plugin.commands.export_loss import Loss, Shown, Written
 from freqgs_plugin.commands.export_options import ExportOptions
 from freqgs_plugin.commands.export_source import Source, open_source
 from freqgs_plugin.commands.options import CommandError
-from freqgs_plugin.reports.bench.page import check_places, circumstances, fill
+from freqgs_plugin.reports.bench.page import check_places, circumstances, fill, read_page
 from freqgs_plugin.reports.bench.runner import write_all
 from freqgs_plugin.reports.bench.tables import BenchTable, number
 from freqgs_plugin.reports.timing import environment
@@ -49,7 +49,7 @@ def _export(options: ExportOptions, console: "Console") -> list[Path]:
     chosen.check(source, options)
     place = _place(source, options)
     if options.docs is not None:
-        page = options.docs.read_text(encoding="utf-8") if options.docs.is_file() else ""
+        page = read_page(options.docs)
         check_places(page, [place], options.docs)
     load, begun = _load(), time.perf_counter()
     with staging(options.output_dir) as folder:
@@ -64,7 +64,7 @@ def _export(options: ExportOptions, console: "Console") -> list[Path]:
     if options.docs is not None:
         text = "\n\n".join([f"*{table.title}.* {circumstances(record)}", table.markdown(), table.note]) + "\n"
         # another export may have filled its place meanwhile
-        page = options.docs.read_text(encoding="utf-8")
+        page = read_page(options.docs)
         check_places(page, [place], options.docs)
         write_all({options.docs: fill(page, place, text).encode()})
     _tell(table, source, paths, console)

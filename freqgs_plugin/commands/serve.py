@@ -22,6 +22,8 @@ def serve(
         port: to listen at; 0 takes a free one.
         mbits: speed of the line in Mbit/s, to see how it arrives; as fast as it goes if left out.
     """
+    from urllib.parse import quote
+
     from rich.console import Console
 
     from freqgs_plugin.commands.options import CommandError
@@ -32,7 +34,9 @@ def serve(
         raise CommandError(f"mbits is {mbits:g}; give a speed above 0, in Mbit/s.")
     if not directory.is_dir():
         raise CommandError(f"{directory} is no folder; name one that `freqgs export --format stream` wrote.")
-    manifests = sorted({*directory.glob(MANIFEST), *directory.glob(f"*/{MANIFEST}")})
+    # what lies elsewhere is not served
+    found = {*directory.glob(MANIFEST), *directory.glob(f"*/{MANIFEST}")}
+    manifests = sorted(path for path in found if path.resolve().is_relative_to(directory.resolve()))
     if not manifests:
         raise CommandError(
             f"{directory} holds no {MANIFEST}; name a folder that `freqgs export --format stream` wrote."
@@ -42,12 +46,13 @@ def serve(
     try:
         server = Server(directory, host, port, mbits)
     except (OSError, OverflowError) as error:
-        raise CommandError(f"cannot listen at {host}:{port} ({error}); choose another --port, 0 for a free one.") from (
-            error
-        )
+        raise CommandError(
+            f"cannot listen at {host}:{port} ({error}); choose another --port, 0 for a free one, or another --host."
+        ) from (error)
     console = Console()
     for path in manifests:
-        below = "" if path.parent == directory else f"/?stream={path.parent.name}/"
+        # a parameter that is an address itself
+        below = "" if path.parent == directory else f"/?stream={quote(quote(path.parent.name))}/"
         console.print(f"{server.url}{below}", soft_wrap=True, highlight=False)
     console.print("Stop with Ctrl-C.")
     with server:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from freqgs_plugin.commands.options import CommandError
 from freqgs_plugin.commands.trim_options import TrimOptions
-from freqgs_plugin.reports.bench.page import check_places, fill
+from freqgs_plugin.reports.bench.page import check_places, fill, read_page
 from freqgs_plugin.reports.bench.runner import check_folder
 from freqgs_plugin.reports.bench.trained import load, quiet
 from freqgs_plugin.reports.tables import finite_json
@@ -55,7 +55,7 @@ def _trim(options: TrimOptions, console: "Console") -> None:
         views = run.num_views("train"), run.num_views("test")
     if not views[0]:
         raise CommandError(f"{options.load_config}: there are no training views to measure on.")
-    page = None if options.docs is None else options.docs.read_text(encoding="utf-8")
+    page = None if options.docs is None else read_page(options.docs)
     if page is not None:
         check_places(page, [place_name(run)], options.docs)
     with console.status("Trimming") as status:
@@ -66,8 +66,6 @@ def _trim(options: TrimOptions, console: "Console") -> None:
     _report(run, steps, options, console)
     text = markdown(f"{old.name}, trimmed", steps, options.max_loss_db)
     record = record_of(str(old), run.config.method_name, options.max_loss_db, steps)
-    if options.docs is not None:
-        _fill(options.docs, place_name(run), _with_circumstances(text, record))
     if options.dry_run:
         console.print("Nothing was written (--dry-run).")
         return
@@ -76,6 +74,8 @@ def _trim(options: TrimOptions, console: "Console") -> None:
         "trim.md": f"# {old.name}, trimmed\n\n{text}",
     }
     config = write_trimmed(run, steps[-1].draft, old, folder.absolute(), more)
+    if options.docs is not None:
+        _fill(options.docs, place_name(run), _with_circumstances(text, record))
     console.print(f"{config}", soft_wrap=True, highlight=False, markup=False)
 
 
@@ -99,7 +99,7 @@ def _with_circumstances(text: str, record: dict[str, Any]) -> str:
 
 def _fill(path: Path, name: str, text: str) -> None:
     """The page as it is now, with the run's part made anew; in one piece."""
-    page = fill(path.read_text(encoding="utf-8"), name, text)
+    page = fill(read_page(path), name, text)
     partial = path.with_name(f".{path.name}")
     partial.write_text(page, encoding="utf-8")
     os.replace(partial, path)

@@ -59,7 +59,7 @@ def _laboratory(options: TrialOptions) -> tuple[list["ExperimentScene"], "Tools"
     from freqgs_plugin.reports.bench.runner import check_folder
     from freqgs_plugin.reports.experiments.lab import Tools
 
-    scenes = [scene_of(folder) for folder in options.scenes]
+    scenes = [scene_of(folder, options.output_dir) for folder in options.scenes]
     check_folder(options.output_dir)
     if options.demo:
         scenes.append(demo_scene(options))
@@ -73,8 +73,8 @@ EXPERIMENTS = {"clod": clod, "claims": claims}
 """name on the command line -> function"""
 
 
-def scene_of(folder: Path) -> "ExperimentScene":
-    """A scene by its folder.
+def scene_of(folder: Path, output_dir: Path | None = None) -> "ExperimentScene":
+    """A scene by its folder, whatever lies in `output_dir`.
 
     Raises:
         ExperimentError: it holds neither a COLMAP model nor a transforms.json.
@@ -83,7 +83,7 @@ def scene_of(folder: Path) -> "ExperimentScene":
 
     folder = folder.resolve()
     parser_of(folder)
-    return ExperimentScene(folder.name, folder, fingerprint(folder))
+    return ExperimentScene(folder.name, folder, fingerprint(folder, output_dir))
 
 
 def demo_scene(options: TrialOptions) -> "ExperimentScene":
@@ -98,8 +98,10 @@ def demo_scene(options: TrialOptions) -> "ExperimentScene":
     manifest = folder / MANIFEST
     written = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
     identity = {"written_by": "freqgs demo", **asdict(scene)}
-    # the model is written last
-    if written != identity or not (folder / "sparse" / "0" / "points3D.bin").is_file():
+    # the model is written last; a page alone needs no photographs
+    if options.page_only:
+        pass
+    elif written != identity or not (folder / "sparse" / "0" / "points3D.bin").is_file():
         write_scene(folder, scene)
     path = zoom_path(build_world(scene.seed), options.frames + 1, width, height)
     return ExperimentScene("demo", folder, json.dumps(identity, sort_keys=True), tuple(path))

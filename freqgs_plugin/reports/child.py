@@ -17,13 +17,13 @@ def child(command: Sequence[str], env: Mapping[str, str] | None = None) -> "Iter
     A session of its own keeps Ctrl-C from the child, so that we end it in an orderly way. So do we when we are told to
     end (SIGTERM): a training that nobody waits for would go on, and write.
     """
-    with _ending_by_exception(), _running(command, env) as process:
+    with ended_by_exception(), _running(command, env) as process:
         yield process
 
 
 @contextmanager
-def _ending_by_exception() -> Iterator[None]:
-    """SIGTERM raises SystemExit, so that blocks are left in order; signals reach the main thread only."""
+def ended_by_exception() -> Iterator[None]:
+    """SIGTERM raises SystemExit(143), so that blocks are left in order; signals reach the main thread only."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -105,6 +105,8 @@ class Handler(SimpleHTTPRequestHandler):
 
     def _file(self) -> Path | None:
         name = unquote(urlsplit(self.path).path)
+        if "\0" in name:
+            return None
         page = PAGE / ("index.html" if name == "/" else name.lstrip("/"))
         if page.parent == PAGE and page.is_file():
             return page

@@ -42,7 +42,7 @@ def read_camera_path(path: Path) -> CameraPath:
         with np.errstate(all="ignore"):
             cameras = get_path_from_json(described) if views else None
         fps = float(described.get("fps", 24.0))
-    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
         raise ValueError(
             f"{path} is no camera path ({type(error).__name__}: {error}); save one in the viewer's Render tab."
         ) from error

@@ -107,7 +107,13 @@ class LapSplatModel(FreqSplatModel):
         config = self.config
         if isinstance(config.num_levels, int) and config.num_levels < 1:
             raise ValueError(f"num_levels is {config.num_levels}; it must be at least 1, or auto.")
-        for name in ("auto_psnr", "auto_share", "least_level_gain"):
+        opacity = config.new_level_opacity
+        if opacity is not None and not 0 < opacity < 1:
+            raise ValueError(f"new_level_opacity is {opacity}; it must be between 0 and 1, or None: as the originals.")
+        if not 0 < config.coarse_growth_factor < float("inf"):
+            raise ValueError(f"coarse_growth_factor is {config.coarse_growth_factor}; it must be a finite number > 0.")
+        weights = ("image_weight", "dft_weight", "lower_level_weight")
+        for name in ("auto_psnr", "auto_share", "least_level_gain", *weights):
             if not 0 <= getattr(config, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(config, name)}; it must be a finite number >= 0.")
         if not 0 < config.base_share <= 1:

@@ -87,6 +87,12 @@ class SplatViews(SplatfactoModel):
             raise ValueError(f"rasterize_mode is '{self.config.rasterize_mode}'; choose antialiased or classic.")
         if self.config.dropout is not None and not 0 <= self.config.dropout < 1:
             raise ValueError(f"dropout is {self.config.dropout}; it is a share of the Gaussians, in [0, 1).")
+        for name in ("densify_grad_thresh", "split_screen_size"):
+            if not 0 < getattr(self.config, name) < float("inf"):
+                raise ValueError(f"{name} is {getattr(self.config, name)}; it must be a finite number > 0.")
+        for name in ("opacity_penalty", "size_penalty", "least_weight", "max_gaussians", "target_cache_mb", "seed"):
+            if not 0 <= getattr(self.config, name) < float("inf"):
+                raise ValueError(f"{name} is {getattr(self.config, name)}; it must be a finite number >= 0.")
         scale = self.config.steps_scale
         if scale is not None and not 0 < scale < float("inf"):
             raise ValueError(f"steps_scale is {scale}; it must be a finite number > 0, or None: by the run's length.")

@@ -379,5 +379,10 @@ def test_fingerprints_follow_the_files_and_not_the_place(tmp_path):
     (tmp_path / "a" / "room" / "images_2").mkdir()
     (tmp_path / "a" / "room" / "images_2" / "x.png").write_text("1")
     assert fingerprint(tmp_path / "a" / "room") == one, "nerfstudio makes these"
+    ours = tmp_path / "a" / "room" / "clod-out"
+    ours.mkdir()
+    (ours / "clod.json").write_text("written by an experiment")
+    assert fingerprint(tmp_path / "a" / "room", ours) == one != fingerprint(tmp_path / "a" / "room")
+    (ours / "clod.json").unlink()
     (tmp_path / "a" / "room" / "images" / "x.png").write_text("123456")
     assert fingerprint(tmp_path / "a" / "room") != one

@@ -3,8 +3,10 @@
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -48,6 +50,47 @@ def test_a_damaged_step_is_named(tmp_path):
     path.write_text(path.read_text()[:-20])
     with pytest.raises(ExperimentError, match=f"{path.name} is damaged .*remove it"):
         store.read("curve", {})
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"seconds": "x"}, "seconds is 'x'"),
+        ({"date": 5}, "date is 5"),
+        ({"digest": None}, "without digest"),
+        ({"settings": {}}, "its settings are not those of its name"),
+        (None, "maximum recursion depth"),
+    ],
+)
+def test_a_record_of_other_types_is_named(tmp_path, change, why):
+    store = Store(tmp_path)
+    store.write("curve", {"a": 1}, {"psnr": 27.0}, 0.0)
+    path = store.path("curve", {"a": 1})
+    record = {**json.loads(path.read_text()), **(change or {})}
+    text = json.dumps({name: value for name, value in record.items() if value is not None})
+    path.write_text("[" * 100_000 if change is None else text)
+    with pytest.raises(ExperimentError, match=f"is damaged .*{why}.*remove it"):
+        store.read("curve", {"a": 1})
+
+
+@pytest.mark.parametrize("error", [ValueError("it is truncated."), FileNotFoundError("there is none.")])
+def test_a_run_that_cannot_be_loaded_is_named_with_its_step(tmp_path, error):
+    lab, tools = fake_lab(tmp_path)
+    training = Trial(SCENE, 30, 42).plain()
+    lab.config_path(training)
+
+    def fail(path):
+        raise error
+
+    lab = replace(lab, tools=replace(lab.tools, load=fail))
+    (step,) = (tmp_path / "steps").glob("train-*.json")
+    with pytest.raises(ExperimentError, match=f"cannot be loaded .* Remove .*{step.name}, and it is trained again"):
+        lab.run(training)
+    step.unlink()
+    # as the real training does: whatever is left of an earlier try goes
+    shutil.rmtree(tools.folder)
+    lab.config_path(training)
+    assert len(tools.trained) == 2
 
 
 def test_an_edited_result_is_named(tmp_path):

@@ -7,9 +7,14 @@ import re
 import signal
 import subprocess
 import sys
+import threading
+import urllib.error
+import urllib.request
 from dataclasses import replace
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.parse import parse_qs, unquote, urlsplit
 
 import pytest
 import torch
@@ -24,6 +29,7 @@ from freqgs_plugin.reports.bench.stream_measure import Point
 from freqgs_plugin.reports.bench.stream_verdict import complete_from, without_holes_from, worst_dip
 from freqgs_plugin.stream.client import fetch
 from freqgs_plugin.stream.manifest import MANIFEST
+from freqgs_plugin.stream.server import Server
 
 
 @pytest.fixture
@@ -75,6 +81,38 @@ def test_a_ply_is_streamed_and_served(ply, tmp_path, capsys):
     received = fetched.received.gaussians()
     assert not received.signed_residuals and len(received) == 120
     assert torch.equal(received.means.sort(0).values, gaussians.means.sort(0).values)
+
+
+def test_names_that_an_address_cannot_hold(ply, tmp_path, monkeypatch, capsys):
+    """And a link out of the folder is not offered, as it is not served."""
+    path, _ = ply
+    for folder in (tmp_path / "many" / "a b#c&d é", tmp_path / "elsewhere"):
+        main(["stream", str(path), "--output-dir", str(folder)])
+    (tmp_path / "many" / "link").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    capsys.readouterr()
+    answers = []
+
+    def served(server):
+        thread = threading.Thread(target=ThreadingHTTPServer.serve_forever, args=(server,))
+        thread.start()
+        try:
+            for name in ("/a%20b%23c%26d%20%C3%A9/manifest.json", "/link/manifest.json", "/%00", "/x.json%00"):
+                try:
+                    answers.append(urllib.request.urlopen(server.url + name, timeout=20).status)
+                except urllib.error.HTTPError as error:
+                    answers.append(error.code)
+        finally:
+            server.shutdown()
+            thread.join()
+
+    monkeypatch.setattr(Server, "serve_forever", served)
+    main(["serve", str(tmp_path / "many"), "--port", "0"])
+    first, *_ = lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 and first.startswith("http://127.0.0.1:")
+    # as the page reads it: a parameter that is an address
+    (stream,) = parse_qs(urlsplit(first).query)["stream"]
+    assert unquote(stream) == "a b#c&d é/" and not set(stream) & set(" #&")
+    assert answers == [200, 404, 404, 404]
 
 
 @pytest.mark.parametrize("variant", ["exact", "balanced"])

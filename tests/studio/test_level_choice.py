@@ -71,10 +71,19 @@ def test_gains_are_differences_of_psnr(make_trainer):
     assert not gain.active and 2 in trainer.pipeline.datamanager.train_unseen_cameras
 
 
-@pytest.mark.parametrize("name", ["auto_psnr", "auto_share", "least_level_gain"])
-def test_impossible_settings(make_trainer, name):
-    with pytest.raises(ValueError, match=f"{name} is nan"):
-        make_trainer(**{name: float("nan")})
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, float("nan")) for name in ("auto_psnr", "auto_share", "least_level_gain", "dft_weight")),
+        *(("image_weight", float("inf")), ("lower_level_weight", -1.0), ("coarse_growth_factor", 0.0)),
+        *(("new_level_opacity", value) for value in (0.0, 1.0, 2.0, float("nan"))),
+        *(("opacity_penalty", float("nan")), ("split_screen_size", float("nan")), ("densify_grad_thresh", 0.0)),
+        *((name, -1) for name in ("size_penalty", "least_weight", "max_gaussians", "target_cache_mb", "seed")),
+    ],
+)
+def test_impossible_settings(make_trainer, name, value):
+    with pytest.raises(ValueError, match=f"{name} is {value}; it must be"):
+        make_trainer(**{name: value})
 
 
 def test_the_base_is_bounded_in_the_last_stage(make_trainer):

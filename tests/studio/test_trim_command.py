@@ -178,9 +178,13 @@ def test_dead_gaussians_and_empty_levels_go(trained, spoilt, trim):
 
 
 def test_a_dry_run_writes_nothing(trained, tmp_path, trim):
-    before = contents(trained.parent)
-    assert "Nothing was written" in trim("--load-config", trained, "--dry-run", "--max-loss-db", 0)
+    before, page = contents(trained.parent), tmp_path / "page.md"
+    page.write_text("<!-- trim lapsplat scene -->\n<!-- end of trim lapsplat scene -->\n")
+    empty = page.read_text()
+    more = ("--dry-run", "--max-loss-db", 0, "--docs", page)
+    assert "Nothing was written" in trim("--load-config", trained, *more)
     assert contents(trained.parent) == before and not trained.parent.with_name("run-trimmed").exists()
+    assert page.read_text() == empty
 
 
 # -- what goes wrong ----------------------------------------------------------------------------------------------

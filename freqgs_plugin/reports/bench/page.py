@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from freqgs_plugin.reports.bench.options import BenchError
@@ -11,6 +12,20 @@ from freqgs_plugin.reports.bench.tables import BenchTable
 def place(name: str) -> tuple[str, str]:
     """The comments around the table `name` in a page."""
     return f"<!-- {name} -->", f"<!-- end of {name} -->"
+
+
+def read_page(path: Path) -> str:
+    """A page of Markdown; empty where there is none.
+
+    Raises:
+        BenchError: it is not UTF-8.
+    """
+    try:
+        return path.read_text(encoding="utf-8") if path.is_file() else ""
+    except UnicodeDecodeError as error:
+        raise BenchError(f"{path} is not text in UTF-8 ({error}); name a page of Markdown, or save it as UTF-8.") from (
+            error
+        )
 
 
 def check_places(page: str, names: Sequence[str], path: object) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from freqgs_plugin.reports.bench.options import BenchError, BenchOptions
-from freqgs_plugin.reports.bench.page import check_places, fill, table_text
+from freqgs_plugin.reports.bench.page import check_places, fill, read_page, table_text
 from freqgs_plugin.reports.bench.tables import BenchTable
 from freqgs_plugin.reports.tables import finite_json
 from freqgs_plugin.reports.timing import environment
@@ -69,7 +69,7 @@ def run_bench(bench: Bench, options: BenchOptions, console: "Console", *argument
     """
     page = None
     if options.docs is not None:
-        page = options.docs.read_text(encoding="utf-8") if options.docs.is_file() else ""
+        page = read_page(options.docs)
         check_places(page, bench.tables, options.docs)
     check_folder(options.output_dir)
     load = _load()

@@ -89,9 +89,7 @@ def _with_speeds(*names: str) -> Callable[[Lab, Trial, TrialOptions], dict[str, 
             "claims-speeds",
             trainings,
             {"names": list(names)},
-            lambda: speeds(
-                {name: lab.tools.load(lab.config_path(t)) for name, t in zip(names, trainings, strict=True)}
-            ),
+            lambda: speeds({name: lab.load(t, lab.config_path(t)) for name, t in zip(names, trainings, strict=True)}),
         )
         return {"runs": runs, "times": times}
 

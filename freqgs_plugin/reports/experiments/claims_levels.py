@@ -44,7 +44,7 @@ def measure(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
         "claims-speeds",
         list(trainings.values()),
         {"names": list(trainings)},
-        lambda: speeds({name: lab.tools.load(lab.config_path(t)) for name, t in trainings.items()}),
+        lambda: speeds({name: lab.load(t, lab.config_path(t)) for name, t in trainings.items()}),
     )
     return {"runs": runs, "times": times}
 

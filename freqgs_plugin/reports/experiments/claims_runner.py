@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from freqgs_plugin.reports.bench.page import check_places, fill
+from freqgs_plugin.reports.bench.page import check_places, fill, read_page
 from freqgs_plugin.reports.bench.runner import check_folder, write_all
 from freqgs_plugin.reports.experiments import claims_goals, claims_levels
 from freqgs_plugin.reports.experiments.claims import CLAIMS, RUNS, of_runs
@@ -87,6 +87,8 @@ def run_claims(options: ClaimsOptions, scenes: Sequence[ExperimentScene], tools:
 
 def _chosen(only: Iterable[str]) -> list[str]:
     wanted = [name for item in only for name in item.split(",") if name]
+    if only and not wanted:
+        raise ExperimentError(f"--only {' '.join(only)} names nothing: choose among {', '.join(MEASURED)}")
     unknown = [name for name in wanted if name not in MEASURED]
     if unknown:
         raise ExperimentError(f"--only {' '.join(unknown)}: choose among {', '.join(MEASURED)}")
@@ -96,7 +98,7 @@ def _chosen(only: Iterable[str]) -> list[str]:
 def _check_page(docs: Path | None, scenes: Sequence[ExperimentScene], names: Sequence[str]) -> None:
     """Before hours of work."""
     if docs is not None:
-        page = docs.read_text(encoding="utf-8") if docs.is_file() else ""
+        page = read_page(docs)
         parts = dict.fromkeys(place_of(name) for name in names)
         check_places(page, [f"{part} {scene.name}" for scene in scenes for part in parts], docs)
         check_folder(docs.parent)
@@ -129,7 +131,7 @@ def _report(
         options.output_dir / "claims.md": markdown_page(found).encode(),
     }
     if options.docs is not None:
-        page = options.docs.read_text(encoding="utf-8")
+        page = read_page(options.docs)
         for name, (record, of_scene) in found.items():
             for place, text in places(name, record, of_scene).items():
                 page = fill(page, place, text)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from freqgs_plugin.reports.drawing import HeldOutView, TrainedRun
+from freqgs_plugin.reports.experiments.options import ExperimentError
 from freqgs_plugin.reports.experiments.progress import Progress
 from freqgs_plugin.reports.experiments.store import Store, key
 from freqgs_plugin.reports.experiments.training import Training
@@ -95,9 +96,23 @@ class Lab:
             while len(self._loaded) >= _KEPT:
                 self._loaded.popitem(last=False)
             with self.progress.task(f"{training.scene.name}: loading {training.method}", None), self._into_log():
-                self._loaded[of] = self.tools.load(path)
+                self._loaded[of] = self.load(training, path)
         self._loaded.move_to_end(of)
         return self._loaded[of]
+
+    def load(self, training: Training, config: Path) -> Any:
+        """The trained run of that config.yml, loaded anew.
+
+        Raises:
+            ExperimentError: its checkpoint is damaged, or gone.
+        """
+        try:
+            return self.tools.load(config)
+        except (ValueError, OSError) as error:
+            step = self.store.path("train", self._settings(training))
+            raise ExperimentError(
+                f"{config.parent} cannot be loaded ({error}) Remove {step}, and it is trained again."
+            ) from error
 
     def _done(self, name: str, settings: dict[str, Any], do: Callable[[], Any]) -> dict[str, Any]:
         record = self.store.read(name, settings)

@@ -15,6 +15,9 @@ from freqgs_plugin.reports.experiments.options import ExperimentError
 from freqgs_plugin.reports.tables import finite_json
 from freqgs_plugin.reports.timing import environment
 
+_FIELDS = {"settings": dict, "seconds": (int, float), "date": str, "commit": str}
+"""of every record, and their types"""
+
 
 @dataclass(frozen=True)
 class Store:
@@ -39,14 +42,19 @@ class Store:
             record = json.loads(path.read_text(encoding="utf-8"))
             if not isinstance(record, dict) or ("settings" in record and record.get("result") is None):
                 raise ValueError("no finished step")
-            missing = [name for name in ("settings", "seconds", "date", "commit") if name not in record]
+            missing = [name for name in (*_FIELDS, "digest") if name not in record]
             if missing:
                 raise ValueError(f"without {', '.join(missing)}")
-            if record.get("digest", found := key({"result": record["result"]})) != found:
+            wrong = [name for name, kind in _FIELDS.items() if not isinstance(record[name], kind)]
+            if wrong:
+                raise ValueError(f"{wrong[0]} is {record[wrong[0]]!r:.40}")
+            if record["digest"] != key({"result": record["result"]}):
                 raise ValueError("its result was changed")
-        except ValueError as error:
+            if record["settings"] != _as_json(settings):
+                raise ValueError("its settings are not those of its name")
+        except (ValueError, RecursionError) as error:
             raise ExperimentError(f"{path} is damaged ({error}); remove it, and the step is done again") from error
-        return record if record.get("settings") == _as_json(settings) else None
+        return record
 
     def write(self, name: str, settings: dict[str, Any], result: Any, seconds: float) -> dict[str, Any]:
         """Save a finished step in one piece, and return its record as `read` would. Infinite numbers become null."""

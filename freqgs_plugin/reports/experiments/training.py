@@ -78,12 +78,18 @@ class Trial:
         return Training(self.scene, "lapsplat", self.steps, self.seed, {**PLAIN, **more})
 
 
-def fingerprint(folder: Path) -> str:
-    """A hash of names and sizes of all files of a scene; images that nerfstudio downscaled itself do not count."""
+def fingerprint(folder: Path, output_dir: Path | None = None) -> str:
+    """A hash of names and sizes of all files of a scene.
+
+    Images that nerfstudio downscaled itself do not count, nor what an experiment wrote into an `output_dir` below.
+    """
+    ours = None if output_dir is None else output_dir.resolve()
     files = (
         path
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and not any(_DOWNSCALED.match(part) for part in path.relative_to(folder).parts)
+        if path.is_file()
+        and not any(_DOWNSCALED.match(part) for part in path.relative_to(folder).parts)
+        and (ours is None or not path.resolve().is_relative_to(ours))
     )
     text = "\n".join(f"{path.relative_to(folder).as_posix()} {path.stat().st_size}" for path in files)
     return f"{folder.resolve().name} {hashlib.sha256(text.encode()).hexdigest()[:16]}"

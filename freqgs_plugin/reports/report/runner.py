@@ -5,7 +5,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from freqgs_plugin.reports.bench.page import check_places, fill
+from freqgs_plugin.reports.bench.page import check_places, fill, read_page
 from freqgs_plugin.reports.bench.runner import IMAGES, check_folder, use_threads, write_all
 from freqgs_plugin.reports.bench.tables import BenchTable
 from freqgs_plugin.reports.experiments.progress import Bars
@@ -39,7 +39,7 @@ def run_report(options: ReportOptions, console: "Console") -> dict[str, Any]:
     """
     page = None
     if options.docs is not None:
-        page = options.docs.read_text(encoding="utf-8") if options.docs.is_file() else ""
+        page = read_page(options.docs)
         check_places(page, [PLACE], options.docs)
         check_folder(options.docs.parent / IMAGES)
     check_output(options.output_dir)
