@@ -52,8 +52,9 @@ def put_in_place(sources: list[Path], destinations: list[Path]) -> None:
         for path in destinations:
             if path.exists():
                 aside = path.with_name(f".{path.name}.{os.getpid()}.old")
-                path.rename(aside)
+                # noted first, for an interrupt between the two
                 old.append((path, aside))
+                path.rename(aside)
         for source, path in zip(sources, destinations, strict=True):
             source.rename(path)
             placed.append(path)
@@ -61,7 +62,8 @@ def put_in_place(sources: list[Path], destinations: list[Path]) -> None:
         for path in placed:
             _remove(path)
         for path, aside in old:
-            aside.rename(path)
+            if aside.exists():
+                aside.rename(path)
         raise
     for _, aside in old:
         _remove(aside)

@@ -44,6 +44,10 @@ class SplatFileError(ValueError):
     """A file or run whose Gaussians cannot be used; the message names the file and the remedy."""
 
 
+_LARGEST_LOG_SCALE = 88.0
+"""whose exponential float32 still holds"""
+
+
 @dataclass(frozen=True)
 class PlySummary:
     """What was found in a file."""
@@ -249,6 +253,13 @@ def _columns(path: Path, vertex: np.ndarray, names: Sequence[str]) -> Float[np.n
             raise SplatFileError(
                 f"{path}: property {name} of {bad} of {len(vertex)} Gaussians is NaN or infinite. Remove them, "
                 "for instance with `splat-transform IN.ply --filter-nan OUT.ply`."
+            )
+        large = int((out[:, i] > _LARGEST_LOG_SCALE).sum()) if name.startswith("scale_") else 0
+        if large:
+            raise SplatFileError(
+                f"{path}: property {name} of {large} of {len(vertex)} Gaussians is over {_LARGEST_LOG_SCALE:g} (up to "
+                f"{out[:, i].max():g}). It is the logarithm of a size, which would be infinite. Remove them, or export "
+                "it again."
             )
     return out
 

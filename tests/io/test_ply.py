@@ -373,6 +373,16 @@ def test_harmonics_that_are_numbered_wrongly(tmp_path):
     refused(write(tmp_path / "a.ply", columns, table(raw)), "numbered from 0")
 
 
+def test_sizes_that_would_be_infinite(tmp_path):
+    raw = gaussians()
+    values = table(raw)
+    values[[2, 5], names(raw).index("scale_1")] = 88.5
+    refused(write(tmp_path / "a.ply", names(raw), values), r"scale_1 of 2 of 12 Gaussians is over 88 \(up to 88.5\)")
+    values[[2, 5], names(raw).index("scale_1")] = 87.0
+    read, _ = read_ply(write(tmp_path / "b.ply", names(raw), values))
+    assert torch.isfinite(read.scales.exp()).all()
+
+
 @pytest.mark.parametrize("name", ["x", "scale_1", "rot_0", "opacity", "f_dc_2", "f_rest_17"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
