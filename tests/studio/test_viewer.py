@@ -75,17 +75,32 @@ SAME = 1.2
 """mean difference of two screenshots of one view, in 0..255, that compression alone may make"""
 
 
-def still(page):
-    """The picture, once it is drawn at full size and stays."""
+def still(page, looks=2):
+    """The picture, once it is drawn at full size and is the same that many times in a row, half a second apart."""
     found = [page.look()]
 
     def again():
         page.page.wait_for_timeout(500)
         found.append(page.look())
-        return page.full() and np.array_equal(*found[-2:])
+        last = found[-looks:]
+        return page.full() and len(last) == looks and all(np.array_equal(last[0], other) for other in last[1:])
 
     wait_until(again, "a picture that stays")
     return found[-1]
+
+
+def back_to(page, picture, folder, what):
+    """Wait for that picture; where it does not come, what is there instead is told and kept beside it."""
+    try:
+        wait_until(lambda: difference(picture, page.look()) < SAME, what)
+    except TimeoutError as error:
+        for name, pixels in (("wanted", picture), ("found", page.look())):
+            write_image(folder / f"{name}.png", pixels.astype(np.uint8))
+        size = "full" if page.full() else "another"
+        raise AssertionError(
+            f"{error}: they differ by {difference(picture, page.look()):.2f}, the panel says {page.drawn()}, the "
+            f"picture has {size} size; wanted.png and found.png are in {folder}"
+        ) from error
 
 
 def without_cameras(page):
@@ -95,7 +110,8 @@ def without_cameras(page):
     wait_until(
         lambda: page.shows("Show Train Cams") and not np.array_equal(before, page.look()), "the frames to vanish"
     )
-    return still(page)
+    # they need not vanish all at once, and what is kept here is compared with minutes later
+    return still(page, looks=6)
 
 
 def until_it_changes(page, before):
@@ -113,9 +129,9 @@ def test_each_control_in_a_browser(trained, viewer, chromium, tmp_path):
     assert not any(
         map(page.shows, ("Budget (thousands)", "Gaze radius", "Focus radius", "Move the gaze", "Mask folder"))
     )
-    use_modes(page, counts, full)
+    use_modes(page, counts, full, tmp_path)
     use_gaze(page, counts)
-    use_filters(page, counts)
+    use_filters(page, counts, tmp_path)
     use_focus(page, counts)
     use_masks(page, counts, tmp_path)
     page.choose("Focus", "off")
@@ -147,7 +163,7 @@ def use_masks(page, counts, folder):
     assert page.drawn()[0] == few
 
 
-def use_modes(page, counts, full):
+def use_modes(page, counts, full, folder):
     page.choose("Mode", "band")
     band = until_it_changes(page, full)
     assert band.std() < full.std(), "a band is mostly grey"
@@ -155,7 +171,7 @@ def use_modes(page, counts, full):
     wait_until(lambda: page.drawn()[0] == counts[0], "the base")
     page.choose("Mode", "all")
     wait_until(lambda: page.drawn()[0] == counts[2], "everything")
-    wait_until(lambda: difference(full, page.look()) < SAME, "the full picture")
+    back_to(page, full, folder, "the full picture")
     assert not page.shows("Level of detail")
     page.choose("Mode", "budget")
     wait_until(lambda: page.shows("Budget (thousands)"), "the budget's field")
@@ -195,7 +211,7 @@ def use_gaze(page, counts):
     wait_until(lambda: page.drawn()[0] == counts[2], "everything")
 
 
-def use_filters(page, counts):
+def use_filters(page, counts, folder):
     before = still(page)
     pictures = []
     for name in ("xray", "brush", "sharp"):
@@ -204,7 +220,7 @@ def use_filters(page, counts):
         assert difference(before, pictures[-1]) > SAME
     wait_until(lambda: page.drawn()[0] == counts[0] + counts[2] - counts[1], "what is not of level 2")
     page.choose("Filter", "off")
-    wait_until(lambda: difference(before, page.look()) < SAME, "the plain picture")
+    back_to(page, before, folder, "the plain picture")
 
 
 def use_focus(page, counts):
