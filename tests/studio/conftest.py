@@ -63,7 +63,7 @@ def faded(scene, shared):
 
 
 def run_of(method, scene, shared, *more):
-    """config.yml of a run with checkpoints of every 25 steps, and `log.txt` beside it."""
+    """config.yml of a run with checkpoints of every 25 steps; beside it `log.txt`, and `peak.txt` with GB of memory."""
     every = ("--max-num-iterations", STEPS, "--steps-per-save", 25, "--save-only-latest-checkpoint", False)
     place = Path("small", method, "run", "config.yml")
 
@@ -71,6 +71,7 @@ def run_of(method, scene, shared, *more):
         done = command("ns-train", *train_arguments(scene, output, *every, *more, method=method))
         assert done.code == 0 and (output / place).is_file(), str(done)
         (output / place).with_name("log.txt").write_text(done.text)
+        (output / place).with_name("peak.txt").write_text(str(done.peak))
 
     return shared(method, make) / place
 

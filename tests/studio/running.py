@@ -32,6 +32,8 @@ class Finished:
 
     code: int
     text: str
+    peak: float
+    """the most memory that it had resident, GB; 0 where the system does not tell"""
 
     def __str__(self):
         return f"exit status {self.code}:\n{self.text[-6000:]}"
@@ -54,15 +56,13 @@ def command(name, *arguments, timeout=200, folder=None):
         )
         alarm = threading.Timer(timeout, process.kill)
         alarm.start()
+        peak = 0.0
         while process.poll() is None:
-            _peaks.append(max(_peaks.pop(), high_water_mark(process.pid)))
+            peak = max(peak, high_water_mark(process.pid))
             time.sleep(0.05)
         alarm.cancel()
         output.seek(0)
-        return Finished(process.returncode, output.read().decode(errors="replace"))
-
-
-_peaks = [0.0]
+        return Finished(process.returncode, output.read().decode(errors="replace"), peak)
 
 
 def high_water_mark(pid):
@@ -75,11 +75,6 @@ def high_water_mark(pid):
     except OSError:
         return 0.0
     return sum(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 2**20
-
-
-def peak_gigabytes():
-    """The most memory that any command so far had resident."""
-    return _peaks[0]
 
 
 def train_arguments(scene, output, *more, timestamp="run", method="lapsplat"):
