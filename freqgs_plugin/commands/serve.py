@@ -48,7 +48,7 @@ def serve(
     except (OSError, OverflowError) as error:
         raise CommandError(
             f"cannot listen at {host}:{port} ({error}); choose another --port, 0 for a free one, or another --host."
-        ) from (error)
+        ) from error
     console = Console()
     for path in manifests:
         # a parameter that is an address itself

@@ -98,10 +98,10 @@ def demo_scene(options: TrialOptions) -> "ExperimentScene":
     manifest = folder / MANIFEST
     written = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
     identity = {"written_by": "freqgs demo", **asdict(scene)}
-    # the model is written last; a page alone needs no photographs
-    if options.page_only:
-        pass
-    elif written != identity or not (folder / "sparse" / "0" / "points3D.bin").is_file():
+    # the model is written last
+    complete = written == identity and (folder / "sparse" / "0" / "points3D.bin").is_file()
+    # a page alone needs no photographs
+    if not complete and not options.page_only:
         write_scene(folder, scene)
     path = zoom_path(build_world(scene.seed), options.frames + 1, width, height)
     return ExperimentScene("demo", folder, json.dumps(identity, sort_keys=True), tuple(path))
