@@ -1,7 +1,8 @@
 """Writes what photographs in memory and on disk cost into docs/trim.md: peak memory, time to load, time of a step.
 
 `python docs/measure_photographs.py make SCENE` writes a scene of random textures, `... measure SCENE ...` measures each
-scene in memory, on disk and once more on disk, in a process each, and puts the tables between the page's markers.
+scene in memory, on disk and once more on disk, in a process each, and fills the place `photographs NAME` of the page,
+where NAME is that of the scene's folder.
 """
 
 import itertools
@@ -16,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 PAGE = Path(__file__).parent / "trim.md"
-BEGIN, END = "<!-- photographs: written by docs/measure_photographs.py -->", "<!-- end of photographs -->"
 VIEWS, WIDTH, HEIGHT = 300, 1600, 1000
 STEPS = 60
 
@@ -108,17 +108,24 @@ def turns(scene: Path, cache: Path) -> dict[str, float]:
     return {where: timing.median_ms for where, timing in times.items()}
 
 
+def compile_kernels(scene: Path) -> None:
+    """Where numba's cache lacks them, the first process would be charged with compiling them: time and memory."""
+    with tempfile.TemporaryDirectory() as cache:
+        child("load", scene, "memory", cache)
+
+
+def child(*arguments: object) -> dict[str, float]:
+    """What this file prints in a process of its own."""
+    command = [sys.executable, "-W", "ignore", __file__, *map(str, arguments)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
 def measured(scene: Path) -> str:
     """A table of one scene."""
     rows = ["| photographs | to load, s | peak of own memory, MB | of mapped files, MB | of both, MB |"]
     rows.append("| --- | ---: | ---: | ---: | ---: |")
     with tempfile.TemporaryDirectory() as cache:
-
-        def child(*arguments: object) -> dict[str, float]:
-            command = [sys.executable, "-W", "ignore", __file__, *map(str, arguments)]
-            done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-            return json.loads(done.stdout.strip().splitlines()[-1])
-
         for name, where in (("in memory", "memory"), ("on disk, first run", "disk"), ("on disk, later run", "disk")):
             found = child("load", scene, where, cache)
             values = (f"{found['load']:.1f}", *(f"{found[k]:,.0f}" for k in ("RssAnon", "RssFile", "VmRSS")))
@@ -131,16 +138,20 @@ def measured(scene: Path) -> str:
 
 
 def measure(scenes: list[Path]) -> None:
+    """One scene after another; each is in the page as soon as it is measured."""
+    from freqgs_plugin.reports.bench.page import check_places, fill, read_page
     from freqgs_plugin.reports.timing import environment
 
-    now, load_average = environment(), os.getloadavg()[2]
-    hardware, names = now["hardware"], " ".join(scene.name for scene in scenes)
-    head = f"*Measured {now['date'][:10]}, commit {now['commit']}, {hardware['processor']}, {hardware['cores']} cores, "
-    head += f"{hardware['threads']} thread, no GPU, beside other work (load average {load_average:.1f}): "
-    head += f"`python docs/measure_photographs.py measure {names}`.*"
-    text = "\n\n".join([head, *map(measured, scenes)])
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    PAGE.write_text(f"{before}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    check_places(read_page(PAGE), [f"photographs {scene.name}" for scene in scenes], PAGE)
+    compile_kernels(scenes[0])
+    for scene in scenes:
+        text, now, load_average = measured(scene), environment(), os.getloadavg()[1]
+        hardware = now["hardware"]
+        machine = f"{hardware['processor']}, {hardware['cores']} cores, {hardware['threads']} thread, no GPU"
+        head = f"*Measured {now['date'][:10]}, commit {now['commit']}, {machine}, load average of the last minutes "
+        head += f"{load_average:.1f}: `python docs/measure_photographs.py measure {scene.name}`.*"
+        page = fill(read_page(PAGE), f"photographs {scene.name}", f"{head}\n\n{text}")
+        PAGE.write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

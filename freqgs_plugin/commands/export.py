@@ -76,11 +76,15 @@ _OF_FORMATS = {"variant": ("stream", "html"), "sog": ("levels",)}
 
 
 def _check_use(options: ExportOptions) -> None:
-    """Refuse what would do nothing."""
+    """Refuse what would do nothing, and numbers that are none."""
     for name, formats in _OF_FORMATS.items():
         if getattr(options, name) != getattr(ExportOptions, name) and options.format not in formats:
             option = f"--variant {options.variant}" if name == "variant" else "--no-sog"
             raise ValueError(f"{option} does nothing with --format {options.format}, but with {', '.join(formats)}.")
+    if options.distance is not None and not 0 <= options.distance < float("inf"):
+        raise ValueError(f"--distance {options.distance:g}: give a number of 0 or more (1 is the scene's distance).")
+    if not 0 < options.detail < float("inf"):
+        raise ValueError(f"--detail {options.detail:g}: give a number above 0 (1 is as seen from --distance).")
     for name in ("bake_steps", "seed") if not options.bake else ():
         if getattr(options, name) != getattr(ExportOptions, name):
             option = f"--{name.replace('_', '-')} {getattr(options, name)}"

@@ -100,7 +100,8 @@ def write_as_levels(source: Source, options: ExportOptions, work: Work) -> list[
     for level in range(1, source.levels + 1):
         begun, part = time.perf_counter(), source.up_to(level)
         if not len(part.raw):
-            raise ValueError(f"the prefix of level {level} holds no Gaussians; choose another --crop.")
+            remedy = "choose another --crop" if options.crop is not None else "`freqgs trim` removes empty levels"
+            raise ValueError(f"the prefix of level {level} holds no Gaussians; {remedy}.")
         made = plain(part, options, work.console, f"levels 1-{level}")
         written.append(_written(made, part, options, folder / f"prefix_{level}.ply", begun))
         prefixes.append(made)

@@ -73,7 +73,9 @@ def plain(source: Source, options: ExportOptions, console: "Console", what: str 
     raw = replace(raw, **extras)
     seen = raw.opacities[:, 0] >= FAINTEST_LOGIT
     if not bool(seen.any()):
-        raise ValueError("nothing is left to export: every Gaussian is fainter than 1/255. Choose a smaller --detail.")
+        faded = source.raw.decay is not None and "decay" not in options.extra
+        remedy = f"Choose a smaller {_seen_from(source, options)[1]}" if faded else "Export another run"
+        raise ValueError(f"nothing is left to export: every Gaussian is fainter than 1/255. {remedy}.")
     return Plain(raw if bool(seen.all()) else select(raw, seen), mip, note, baked)
 
 
@@ -82,13 +84,20 @@ def _unfading(source: Source, options: ExportOptions) -> tuple[RawGaussians, str
     assert source.raw.decay is not None
     if "decay" in options.extra:
         return raw, "opacities as trained, decay beside them"
-    config = source.scene.run.model.config
-    distance = config.export_distance if options.distance is None else options.distance
-    if not 0 <= distance * options.detail < float("inf") or not options.detail > 0:
-        raise ValueError(f"--distance {distance:g} --detail {options.detail:g}: give numbers >= 0 and > 0.")
+    distance, said = _seen_from(source, options)
+    if not distance * options.detail < float("inf"):
+        raise ValueError(f"{said}: so far away is nothing; choose smaller ones.")
     logits = faded_logits(raw.opacities[:, 0], source.raw.decay, distance * options.detail)
     far = f"opacities as seen from {distance:g} of the scene's distance"
     return replace(raw, opacities=logits[:, None]), far + (f", at detail {options.detail:g}" * (options.detail != 1))
+
+
+def _seen_from(source: Source, options: ExportOptions) -> tuple[float, str]:
+    """The normalised distance, and how the options that matter were given."""
+    distance = source.scene.run.model.config.export_distance if options.distance is None else options.distance
+    given = [f"--distance {distance:g}"] * (options.distance is not None)
+    given += [f"--detail {options.detail:g}"] * (options.detail != ExportOptions.detail)
+    return distance, " or ".join(given) or f"--distance (the run's is {distance:g})"
 
 
 def _activated(raw: RawGaussians, like: Gaussians) -> Gaussians:

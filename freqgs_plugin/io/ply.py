@@ -44,6 +44,8 @@ class SplatFileError(ValueError):
     """A file or run whose Gaussians cannot be used; the message names the file and the remedy."""
 
 
+_LARGEST_HEADER = 1 << 20
+"""bytes; a real one has a few thousand, and to parse a long one takes minutes"""
 _LARGEST_LOG_SCALE = 88.0
 """whose exponential float32 still holds"""
 
@@ -171,11 +173,16 @@ def _parse(path: Path) -> PlyData:
     if path.stat().st_size == 0:
         raise SplatFileError(f"{path} is empty (0 bytes); copy or export it again.")
     with path.open("rb") as stream:
-        start = stream.read(4)
+        start = stream.read(_LARGEST_HEADER)
     if start[:3] != b"ply":
         raise SplatFileError(
-            f"{path} is no PLY file: it begins with {start!r}. Of .splat, .spz, .sog and .ksplat files, make a PLY "
+            f"{path} is no PLY file: it begins with {start[:4]!r}. Of .splat, .spz, .sog and .ksplat files, make a PLY "
             "first (for instance `splat-transform IN OUT.ply`)."
+        )
+    if path.stat().st_size > _LARGEST_HEADER and b"end_header" not in start:
+        raise SplatFileError(
+            f"{path} has no end_header in its first {_LARGEST_HEADER:,} bytes: it is damaged, or no 3DGS PLY. Copy or "
+            "export it again."
         )
     try:
         return PlyData.read(str(path))

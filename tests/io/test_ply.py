@@ -298,6 +298,13 @@ def test_a_truncated_header(tmp_path):
     refused(tmp_path / "a.ply", "is truncated.*early end-of-file")
 
 
+def test_an_endless_header(tmp_path):
+    """To parse it takes as long as it likes."""
+    head = b"ply\nformat binary_little_endian 1.0\n" + b"comment no end\n" * 80_000
+    (tmp_path / "a.ply").write_bytes(head)
+    refused(tmp_path / "a.ply", "has no end_header in its first 1,048,576 bytes.*export it again")
+
+
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 def test_a_count_that_no_memory_holds(tmp_path, form):
     raw = gaussians(3)

@@ -85,6 +85,8 @@ def test_numbers_have_three_digits(value, text):
 def test_table_shows_the_same_cells_everywhere():
     shown = table()
     assert shown.markdown().splitlines() == ["| x | time |", "| --- | ---: |", "| 1.50 | 2.00 (1.00-3.00) |"]
+    odd = BenchTable("odd", "", [{"name": "<b>x|`<y>`\n&"}], [("a<b", lambda row: row["name"])])
+    assert odd.markdown().splitlines() == ["| a&lt;b |", "| --- |", r"| &lt;b>x\|`<y>` &amp; |"]
     console = Console(width=100, record=True, file=io.StringIO())
     console.print(shown.rich())
     text = console.export_text()

@@ -65,6 +65,21 @@ def test_what_is_left_out_has_to_matter():
     )
 
 
+def test_a_claim_on_levels_is_not_judged_where_photographs_are_too_small_for_them():
+    for levels, judged in ((1, ()), (2, ("A-c", "A-f")), (3, ("A-c", "A-d", "A-f"))):
+        run = run_of(**{key: run_of()[key][:levels] for key in ("counts", "prefixes", "added", "scales")})
+        result = dict.fromkeys(("paper", "lapsplat", "no DFT", "no lower levels"), run)
+        verdicts = {name: BY_NAME[name].judge("room", [result]) for name in ("A-c", "A-d", "A-f")}
+        assert {name for name, verdict in verdicts.items() if verdict.holds is not None} == set(judged)
+        found = {name: [] for name in MEASURED} | {"A-f": [result]}
+        (row,) = [line for line in claims_text("room", found, "claims-A", 1).splitlines() if line.startswith("| A-f")]
+        reason = "it needs 2 levels, and these photographs are large enough for 1"
+        assert row.endswith(f"| {reason} | not measurable here |") == (levels == 1)
+        alone = {"gaussians": 1, "small": 1.0, "reduced": 1.0}
+        of_goals = {"runs": {"plain": run_of(), "lapsplat": run, "small base": run}, "alone": [alone] * 2}
+        assert len(claims_goals.goals("room", [of_goals])) == (8 if levels == 3 else 2)
+
+
 def test_figures_of_levels_are_of_prefixes_and_changes():
     run = levels_run()
     found = claims_measures.figures(run)
@@ -120,6 +135,11 @@ def test_a_part_is_measured_alone_and_the_rest_is_said_to_be_missing(tmp_path):
     # A-a, A-f and A-g need no other runs, but nobody asked for what they measure
     assert {line.split(" | ")[0][2:] for line in missing} >= {"A-b", "A-c", "A-d", "A-g"}
     assert "B-a" not in page, "no table of claims none of which was measured"
+    settings["page_only"] = True
+    with pytest.raises(ExperimentError, match="holds nothing finished of levels of these scenes"):
+        run_claims(ClaimsOptions(**settings, only=("levels",)), [SCENE], tools.tools(), console)
+    run_claims(ClaimsOptions(**settings, only=("levels", "A-e")), [SCENE], tools.tools(), console)
+    assert "Nothing finished of levels: room; leave out --page-only to measure it." in console.export_text()
     with pytest.raises(ExperimentError, match="--only A-z: choose among A-a, A-b"):
         run_claims(ClaimsOptions(**settings, only=("A-z",)), [SCENE], tools.tools(), console)
 

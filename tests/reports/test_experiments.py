@@ -352,6 +352,8 @@ def test_sections_are_named_with_spaces_or_commas():
         ({"demo": False}, "name folders with --scenes"),
         ({"seeds": 0}, "at least 1"),
         ({"frames": 3}, "at least 4"),
+        ({"views": 1}, "--views must be at least 2 .* not 1 and 320 240"),
+        ({"size": (16, 15)}, "--size at least 16, not 36 and 16 15"),
         ({"s_max": (0.5,)}, "1 or more"),
         ({"s_max": ()}, "at least one number"),
         ({"scenes": (Path("a/room"), Path("b/room"))}, "told apart by the names"),

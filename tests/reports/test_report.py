@@ -370,6 +370,7 @@ def test_every_file_says_when_where_and_with_what():
     markdown = markdown_page(record, shown, list(plots))
     for text in (page, markdown, points_csv(record).decode(), training_csv(record).decode()):
         assert all(word in text for word in ("2001-02-03", "a processor", "2.9", "abc123", "42", "43"))
+    assert "a &lt;b>" in markdown and "<b>" not in markdown
     for contents in plots.values():
         with Image.open(io.BytesIO(contents)) as image:
             assert image.text["Description"] == sentence(record) and image.size[0] > 800

@@ -177,6 +177,20 @@ class TestDecay:
         thinner = rows(tmp_path / "far" / "splat.ply")
         assert len(thinner) <= len(ours) and thinner["opacity"].mean() < ours["opacity"].mean()
 
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            (("--detail", 1e9), "fainter than 1/255. Choose a smaller --detail 1e+09."),
+            (("--distance", 1e9), "fainter than 1/255. Choose a smaller --distance 1e+09."),
+            (("--detail", 0), "--detail 0: give a number above 0"),
+            (("--distance", -1), "--distance -1: give a number of 0 or more"),
+            (("--distance", 1e300, "--detail", 1e300), "--distance 1e+300 or --detail 1e+300: so far away is nothing"),
+        ],
+    )
+    def test_refusals_name_what_was_given(self, faded, tmp_path, refused, given, message):
+        said = " ".join(refused("export", "--load-config", faded, "--output-dir", tmp_path, *given).split())
+        assert message in said and list(tmp_path.iterdir()) == []
+
     def test_baking_brings_them_closer(self, faded, tmp_path, freqgs):
         found = []
         for more in ((), ("--bake", "--bake-steps", 40)):

@@ -1,5 +1,7 @@
 """A measured table: the same cells for the terminal, for Markdown and, as raw numbers, for JSON."""
 
+import html
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from typing import TYPE_CHECKING, Any
@@ -34,7 +36,7 @@ class BenchTable:
         cells = self.cells()
         align = ["---" if i == 0 else "---:" for i in range(len(self.columns))]
         lines = [[heading for heading, _ in self.columns], align, *cells]
-        return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+        return "\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines)
 
     def rich(self) -> "Table":
         """The table for a terminal."""
@@ -51,6 +53,16 @@ class BenchTable:
     def json(self) -> dict[str, Any]:
         """Title, note and rows, with dataclasses as dictionaries."""
         return {"title": self.title, "note": self.note, "rows": [_plain(row) for row in self.rows]}
+
+
+def without_html(text: str) -> str:
+    """Markdown in which a `<` is shown, not obeyed (a run's name may hold anything); code is left as it is."""
+    return re.sub(r"(`[^`]*`)|([&<])", lambda found: found[1] or html.escape(found[2]), text)
+
+
+def _cell(text: str) -> str:
+    """Neither ends the cell nor the line."""
+    return without_html(" ".join(text.splitlines())).replace("|", "\\|")
 
 
 def _plain(value: Any) -> Any:

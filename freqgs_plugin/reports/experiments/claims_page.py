@@ -65,12 +65,14 @@ def verdicts(scene: str, found: Found) -> list[Row]:
     for claim in CLAIMS:
         results = found[claim.name]
         verdict = asdict(claim.judge(scene, results)) if results else {"found": "-", "holds": None}
-        rows.append({"claim": claim, "scene": scene, **verdict})
+        rows.append({"claim": claim, "scene": scene, "measured": bool(results), **verdict})
     return rows
 
 
 def _verdict(row: Row) -> str:
-    return {True: "holds", False: "does not hold", None: "not measured"}[row["holds"]]
+    if row["holds"] is None:
+        return "not measurable here" if row["measured"] else "not measured"
+    return "holds" if row["holds"] else "does not hold"
 
 
 def verdict_table(rows: Sequence[Row]) -> BenchTable:
@@ -129,9 +131,9 @@ def claims_text(scene: str, found: Found, place: str, seeds: int) -> str:
     rows = [row for row in verdicts(scene, found) if place_of(row["claim"].name) == place]
     fewer = {row["claim"].name: finished_of(len(found[row["claim"].name]), seeds) for row in rows}
     rows = [{**row, "found": f"{row['found']} ({few})"} if (few := fewer[row["claim"].name]) else row for row in rows]
-    judged = [row["holds"] for row in rows if row["holds"] is not None]
-    if not judged:
+    if not any(row["measured"] for row in rows):
         return ""
+    judged = [row["holds"] for row in rows if row["holds"] is not None]
     table = _claim_table(rows).markdown().replace("---:", "---")
     return f"{sum(judged)} of {len(judged)} claims that were measured hold.\n\n{table}"
 

@@ -47,7 +47,7 @@ def run_claims(options: ClaimsOptions, scenes: Sequence[ExperimentScene], tools:
 
     Raises:
         KeyboardInterrupt: passed on, after a message on how to go on.
-        ExperimentError: `page_only`, and nothing is finished; `only` names what there is not.
+        ExperimentError: `page_only`, and nothing is finished, or nothing of `only`; `only` names what there is not.
         BenchError: the page of `docs` lacks the place of a scene.
     """
     names = _chosen(options.only)
@@ -78,8 +78,12 @@ def run_claims(options: ClaimsOptions, scenes: Sequence[ExperimentScene], tools:
             _say(console, f"Stopped. What is finished is kept in {store.folder}; the same command goes on from there.")
             raise
     found, files = _report(options, scenes, finished)
+    for name in names if options.only else ():
+        if lacking := [scene.name for scene in scenes if scene.name not in found or not found[scene.name][1][name]]:
+            _say(console, f"Nothing finished of {name}: {', '.join(lacking)}; leave out --page-only to measure it.")
     console.print(verdict_table([row for name in found for row in verdicts(name, found[name][1])]).rich())
-    console.print(goal_table([goal for name in found for goal in goals_of(name, found[name][1])]))
+    if goals := [goal for name in found for goal in goals_of(name, found[name][1])]:
+        console.print(goal_table(goals))
     for path in files:
         _say(console, str(path))
     return found
@@ -115,8 +119,12 @@ def _report(
         of_scene = collect(options, scene, lab)
         if any(of_scene.values()):
             found[scene.name] = (record_of(options, lab, command), of_scene)
-    if not found:
-        raise ExperimentError(f"{options.output_dir} holds nothing finished of these scenes; leave out --page-only")
+    wanted = _chosen(options.only)
+    if not any(of_scene[name] for _, of_scene in found.values() for name in wanted):
+        what = f"of {', '.join(wanted)} " if options.only else ""
+        raise ExperimentError(
+            f"{options.output_dir} holds nothing finished {what}of these scenes and settings; leave out --page-only"
+        )
     report = {
         name: {
             **record,

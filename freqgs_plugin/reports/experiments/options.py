@@ -9,6 +9,10 @@ Section = Literal["curve", "budget", "pops", "ablation", "sigma"]
 SECTIONS: tuple[Section, ...] = get_args(Section)
 
 
+LEAST_SIDE = 16
+"""pixels of the demo scene's photographs: below that SSIM has no window to compare"""
+
+
 class ExperimentError(RuntimeError):
     """An experiment that cannot be run as asked; the message holds the remedy."""
 
@@ -45,6 +49,11 @@ class TrialOptions:
             raise ExperimentError(
                 f"--steps and --seeds must be at least 1 and --frames at least 4, not {self.steps}, {self.seeds} and "
                 f"{self.frames}"
+            )
+        if self.views < 2 or min(self.size) < LEAST_SIDE:
+            raise ExperimentError(
+                f"--views must be at least 2 and both numbers of --size at least {LEAST_SIDE}, not {self.views} and "
+                f"{self.size[0]} {self.size[1]}"
             )
         names = [folder.resolve().name for folder in self.scenes] + ["demo"] * self.demo
         if len(set(names)) < len(names):

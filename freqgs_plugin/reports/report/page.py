@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from freqgs_plugin.reports.bench.tables import BenchTable
+from freqgs_plugin.reports.bench.tables import BenchTable, without_html
 from freqgs_plugin.reports.report.circumstances import sentence
 
 PLACE = "report"
@@ -55,9 +55,9 @@ def docs_part(record: Mapping[str, Any], tables: Sequence[BenchTable], plots: Ma
 
 def body(record: Mapping[str, Any], tables: Sequence[BenchTable], plots: Mapping[str, str], heading: str) -> list[str]:
     """Circumstances, remarks, plots and tables."""
-    parts = [sentence(record)]
+    parts = [without_html(sentence(record))]
     if found := remarks(record):
-        parts.append("\n".join(f"* {line}" for line in found))
+        parts.append("\n".join(f"* {without_html(line)}" for line in found))
     for name, path in plots.items():
         parts += [f"![{_CAPTIONS[name]}]({path})", caption(name)]
     for table in tables:
