@@ -208,3 +208,21 @@ def test_an_interrupted_report_leaves_nothing(trained, tmp_path, monkeypatch, ca
         main(["report", *configs(trained), "--output-dir", str(tmp_path / "out")])
     assert ended.value.code == 130 and "Nothing was written" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_after_the_last_file_does_not_deny_it(trained, tmp_path, monkeypatch, capsys):
+    from freqgs_plugin.reports.report import runner
+
+    write_folder = runner.write_folder
+
+    def interrupted(*arguments):
+        write_folder(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runner, "write_folder", interrupted)
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as ended:
+        main(["report", *configs(trained), "--rounds", "1", "--views", "1", "--output-dir", str(out)])
+    said = capsys.readouterr().out
+    assert ended.value.code == 130 and f"Stopped. {out} is complete" in said and "Nothing" not in said
+    assert (out / "report.html").is_file()

@@ -3,6 +3,7 @@
 import io
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from freqgs_plugin.reports.bench.page import check_places, fill, read_page
@@ -43,6 +44,7 @@ def run_report(options: ReportOptions, console: "Console") -> dict[str, Any]:
         check_places(page, [PLACE], options.docs)
         check_folder(options.docs.parent / IMAGES)
     check_output(options.output_dir)
+    files: dict[str, bytes] = {}
     try:
         with use_threads(options.threads):
             with Bars(console, "loading", STAGES) as bars:
@@ -57,13 +59,20 @@ def run_report(options: ReportOptions, console: "Console") -> dict[str, Any]:
         if options.docs is not None and page is not None:
             _fill_docs(options, page, record, shown, plots)
     except KeyboardInterrupt:
-        console.print("Stopped. Nothing was written.")
+        # it may have come just after the folder took its place
+        written = bool(files) and _holds(options.output_dir / RECORD, files[RECORD])
+        what = f"{options.output_dir} is complete, and no more was written." if written else "Nothing was written."
+        console.print(f"Stopped. {what}", soft_wrap=True, highlight=False, markup=False)
         raise
     for table in shown:
         console.print(table.rich())
     for line in (*remarks(record), *(str(options.output_dir / name) for name in files)):
         console.print(line.replace("**", ""), soft_wrap=True, highlight=False, markup=False)
     return record
+
+
+def _holds(path: Path, contents: bytes) -> bool:
+    return path.is_file() and path.read_bytes() == contents
 
 
 def _files(record: Mapping[str, Any], shown: Sequence[BenchTable], plots: Mapping[str, bytes]) -> dict[str, bytes]:
