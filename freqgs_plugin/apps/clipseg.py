@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch.nn.functional import interpolate
 
-from freqgs_plugin.apps.segmenters import SegmenterError
+from freqgs_plugin.apps.segmenters import MissingWeightsError, SegmenterError
 from freqgs_plugin.io.images import to_uint8
 
 WEIGHTS = "CIDAS/clipseg-rd64-refined"
@@ -41,12 +41,10 @@ class CLIPSeg:
             model, found = model_class.from_pretrained(str(weights), output_loading_info=True, **options)
         # what the libraries raise for damaged files shares no class with the rest
         except Exception as error:
-            raise SegmenterError(_missing(weights, allow_download)) from error
+            raise _missing(weights, allow_download) from error
         if found["missing_keys"]:
             # transformers makes up what it does not find
-            raise SegmenterError(
-                f"{len(found['missing_keys'])} weights are missing: {_missing(weights, allow_download)}"
-            )
+            raise _missing(weights, allow_download, f"{len(found['missing_keys'])} weights are missing: ")
         self._model: Any = model.eval().to(device)
         self._device = torch.device(device)
 
@@ -71,15 +69,18 @@ def _classes() -> tuple[Any, Any]:
     return CLIPSegProcessor, CLIPSegForImageSegmentation
 
 
-def _missing(weights: str | Path, allow_download: bool) -> str:
+def _missing(weights: str | Path, allow_download: bool, before: str = "") -> MissingWeightsError:
     if Path(weights).is_dir():
-        return (
-            f"the folder {weights} holds no complete CLIPSeg model; it needs what `save_pretrained` of the model and "
-            "of its processor write: config.json, model.safetensors, the image processor's and the tokenizer's files."
+        return MissingWeightsError(
+            f"{before}the folder {weights} holds no complete CLIPSeg model; it needs what `save_pretrained` of the "
+            "model and of its processor write: config.json, model.safetensors, the image processor's and the "
+            "tokenizer's files."
         )
     if allow_download:
-        return f"the CLIPSeg weights '{weights}' could not be downloaded; check the name and the network."
-    return (
-        f"the CLIPSeg weights '{weights}' are neither a folder nor in the cache of the Hugging Face hub, and nothing "
-        "is downloaded unasked. Pass weights=FOLDER with a saved model, or allow_download=True to fetch them once."
+        return MissingWeightsError(
+            f"{before}the CLIPSeg weights '{weights}' could not be downloaded; check the name and the network."
+        )
+    return MissingWeightsError(
+        f"{before}the CLIPSeg weights '{weights}' are neither a folder nor in the cache of the Hugging Face hub.",
+        "Pass weights=FOLDER with a saved model, or allow_download=True to fetch them once.",
     )

@@ -20,6 +20,14 @@ class SegmenterError(RuntimeError):
     """A segmenter that cannot be had or used; the message holds the remedy."""
 
 
+class MissingWeightsError(SegmenterError):
+    """Weights that cannot be had: `what` is wrong, without the remedy, which depends on who asks."""
+
+    def __init__(self, what: str, remedy: str = "") -> None:
+        super().__init__(f"{what} {remedy}".strip())
+        self.what = what
+
+
 @runtime_checkable
 class Segmenter(Protocol):
     """Finds what a text describes in an image."""

@@ -85,6 +85,13 @@ def _check_use(options: ExportOptions) -> None:
         raise ValueError(f"--distance {options.distance:g}: give a number of 0 or more (1 is the scene's distance).")
     if not 0 < options.detail < float("inf"):
         raise ValueError(f"--detail {options.detail:g}: give a number above 0 (1 is as seen from --distance).")
+    if options.crop is not None and not all(a < b for a, b in zip(options.crop[:3], options.crop[3:], strict=True)):
+        given = " ".join(f"{x:g}" for x in options.crop)
+        raise ValueError(f"--crop {given}: each least value must be under its greatest one.")
+    if options.bake and "decay" in options.extra:
+        raise ValueError("--extra decay stores opacities as they are trained, and --bake changes them; leave one out.")
+    if options.bake_steps < 0:
+        raise ValueError(f"--bake-steps {options.bake_steps}: give 0 (only convert colours) or more.")
     for name in ("bake_steps", "seed") if not options.bake else ():
         if getattr(options, name) != getattr(ExportOptions, name):
             option = f"--{name.replace('_', '-')} {getattr(options, name)}"
@@ -126,8 +133,9 @@ def _record(options: ExportOptions, source: Source, load: float | None) -> dict[
         value = getattr(options, option.name)
         if option.name in ("load_config", "output_dir", "docs", "overwrite") or value == option.default:
             continue
-        values = value if isinstance(value, tuple) else () if value is True else (value,)
-        shown += [f"--{option.name.replace('_', '-')}", *map(str, values)]
+        name = option.name.replace("_", "-")
+        values = value if isinstance(value, tuple) else () if isinstance(value, bool) else (value,)
+        shown += [f"--no-{name}" if value is False else f"--{name}", *map(str, values)]
     return {**environment(), "command": shlex.join(shown), "load": load, "quick": False}
 
 

@@ -124,9 +124,9 @@ def write_as_levels(source: Source, options: ExportOptions, work: Work) -> list[
 def check_levels(source: Source, options: ExportOptions) -> None:
     check_plain(source, options)
     if source.levels == 1:
-        raise ValueError(
-            "--format levels: this scene has one level. Export it as ply; for clodsplat, at several --detail."
-        )
+        given = [f"--level {options.level}"] * (options.level is not None) + ["--crop"] * (options.crop is not None)
+        why = f"{' and '.join(given)} leave one level" if given else "this scene has one level"
+        raise ValueError(f"--format levels: {why}. Export it as ply; for clodsplat, at several --detail.")
     if options.extra:
         raise ValueError(f"--extra {' '.join(options.extra)}: files of levels have their level already; leave it out.")
 
@@ -178,7 +178,7 @@ def _write_streamed(
     """The streamed SOG, and what the manifest says of it. A tool that fails or is interrupted costs nothing else."""
     folder = work.folder / LEVELS
     command = streamed_command(names, STREAMED)
-    note: dict[str, Any] = {"command": [NAME, *command], "ran": False, "tool": tool_version()}
+    note: dict[str, Any] = {"command": [NAME, *command], "ran": False, "tool": "not asked"}
     by_hand = f"  {NAME} {' '.join(command)}"
     if find_tool() is None or not options.sog:
         work.console.print(f"For PlayCanvas viewers, after `{INSTALL}`, in {LEVELS}/:", soft_wrap=True)
@@ -188,6 +188,7 @@ def _write_streamed(
     begun = time.perf_counter()
     try:
         with work.console.status("clustering harmonics ..."):
+            note["tool"] = tool_version()
             run_tool(*command, folder=folder)
             made = _streamed(source, options, prefixes, folder, begun)
     except (SplatFileError, KeyboardInterrupt) as error:

@@ -36,7 +36,7 @@ class ExportOptions:
     extra: tuple[Literal["level", "decay"], ...] = ()
     """further properties of the PLY. With decay, opacities are stored as they are trained, not as seen from afar"""
     bake: bool = False
-    """optimise plain colours and opacities against our own pictures: needed for signed residuals"""
+    """optimise plain Gaussians against our own pictures: needed for signed residuals"""
     bake_steps: int = 400
     """steps of that; 0: convert colours only"""
     viewer: Literal["mip", "classic"] | None = None

@@ -44,14 +44,10 @@ def check_plain(source: Source, options: ExportOptions) -> None:
         ValueError: with the remedy.
     """
     if source.signed and not options.bake:
-        raise ValueError(signed_refusal(source.levels))
+        raise ValueError(signed_refusal(source.levels, options.format))
     trained = "mip" if source.scene.antialiased else "classic"
     if viewer_of(source, options) != trained and not options.bake:
         raise ValueError(f"--viewer {options.viewer}: the run was trained for {trained} viewers; add --bake.")
-    if options.bake and "decay" in options.extra:
-        raise ValueError("--extra decay stores opacities as they are trained, and --bake changes them; leave one out.")
-    if options.bake_steps < 0:
-        raise ValueError(f"--bake-steps {options.bake_steps}: give 0 (only convert colours) or more.")
 
 
 def plain(source: Source, options: ExportOptions, console: "Console", what: str = "") -> Plain:

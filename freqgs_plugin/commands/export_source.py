@@ -99,6 +99,9 @@ def open_source(options: ExportOptions) -> Source:
         raise ValueError("--distance and --detail are for scenes with decay; this one has none (use --level).")
     if "decay" in options.extra and not decays:
         raise ValueError("--extra decay: this scene has no decay; train clodsplat, or leave it out.")
+    levels = int(gaussians.level.max()) if len(raw) else 0
+    if options.level is not None and not 1 <= options.level <= levels:
+        raise ValueError(f"--level {options.level}: this scene has levels 1..{levels}.")
     source = Source(
         scene=scene,
         raw=raw,
@@ -108,8 +111,6 @@ def open_source(options: ExportOptions) -> Source:
         cameras=[view.camera for view in views_of_split(run, "train")],
         frame=run.frame,
     )
-    if options.level is not None and not 1 <= options.level <= source.levels:
-        raise ValueError(f"--level {options.level}: this scene has levels 1..{source.levels}.")
     return _chosen(source, options)
 
 
@@ -120,12 +121,17 @@ def _chosen(source: Source, options: ExportOptions) -> Source:
         said.append(f"{lost:,} of {len(raw):,} Gaussians hold values that are NaN or infinite")
     if options.crop is not None:
         inside = _inside(raw.means, options.crop)
-        said.append(f"{int((keep & ~inside).sum()):,} Gaussians lie outside of the crop")
+        if outside := int((keep & ~inside).sum()):
+            said.append(f"{outside:,} Gaussians lie outside of the crop")
         keep &= inside
+    left_out = "; ".join(said)
+    if options.level is not None:
+        higher = source.gaussians.level > options.level
+        said.append(f"{int((keep & higher).sum()):,} are of levels above {options.level}")
+        keep &= ~higher
     if not bool(keep.any()):
         raise ValueError(f"nothing is left to export: {'; '.join(said)}. {_extent(raw)}")
-    source = replace(source if bool(keep.all()) else source.select(keep), left_out="; ".join(said))
-    return source if options.level is None else source.up_to(options.level)
+    return replace(source if bool(keep.all()) else source.select(keep), left_out=left_out)
 
 
 def finite(raw: RawGaussians) -> Bool[Tensor, " n"]:
@@ -145,8 +151,6 @@ def select(raw: RawGaussians, rows: Bool[Tensor, " n"]) -> RawGaussians:
 
 def _inside(means: Float[Tensor, "n 3"], box: tuple[float, ...]) -> Bool[Tensor, " n"]:
     low, high = means.new_tensor(box[:3]), means.new_tensor(box[3:])
-    if not bool((low < high).all()):
-        raise ValueError(f"--crop {' '.join(f'{x:g}' for x in box)}: each least value must be under its greatest one.")
     return ((means >= low) & (means <= high)).all(-1)
 
 

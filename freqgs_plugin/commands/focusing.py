@@ -7,7 +7,7 @@ from typing import Any
 from freqgs_plugin.apps.focus import Focus, Selection, vote, vote_in_folder
 from freqgs_plugin.apps.grabcut import mask_from_box, mask_from_point
 from freqgs_plugin.apps.propagate import propagate
-from freqgs_plugin.apps.segmenters import SegmenterError, get_segmenter, prompt_masks
+from freqgs_plugin.apps.segmenters import MissingWeightsError, SegmenterError, get_segmenter, prompt_masks
 from freqgs_plugin.commands.scene import Scene
 from freqgs_plugin.reports.bench.trained import views_of_split
 
@@ -33,8 +33,10 @@ def focus_on(scene: Scene, text: str, outside_level: int, weights: Path | None) 
             raise ValueError(f"--focus {text} names nothing; say what to look for, as in {TEXT}the red ball.")
         try:
             segmenter = get_segmenter("clipseg", **({} if weights is None else {"weights": weights}))
-        except SegmenterError as error:
-            raise SegmenterError(f"{error} The folder is given with --segmenter-weights.") from error
+        except MissingWeightsError as error:
+            raise SegmenterError(
+                f"{error.what} Name a folder with a saved model with --segmenter-weights; nothing is downloaded."
+            ) from error
         masks = prompt_masks(segmenter, [view.image for view in views], prompt)
         found = vote(scene.gaussians, [view.camera for view in views], masks, **drawing)
         return Focus(found.rows, outside_level), found

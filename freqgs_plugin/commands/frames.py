@@ -41,8 +41,11 @@ class FrameFolder:
         FileExistsError: it holds frames of other settings, or files of these names that are no such frames.
     """
 
+    budget: int | None
+    """Gaussians per view that these frames were drawn with, where a budget was given; kept with the frames"""
+
     def __init__(self, folder: Path, settings: dict[str, Any], names: Sequence[str] = ()):
-        self.folder, self._settings = folder, settings
+        self.folder, self._settings, self.budget = folder, settings, None
         self._key = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:16]
         self.records: dict[str, FrameRecord] = {}
         if (folder / RECORD).is_file():
@@ -52,7 +55,6 @@ class FrameFolder:
                 f"{folder / there[0]} is there already, and no {RECORD} says that it is a frame; name another "
                 "--output-dir, or move it away."
             )
-        folder.mkdir(parents=True, exist_ok=True)
 
     def _read(self) -> dict[str, FrameRecord]:
         path = self.folder / RECORD
@@ -60,6 +62,9 @@ class FrameFolder:
             stored = json.loads(path.read_text(encoding="utf-8"))
             found = [{**r, "gaze": r["gaze"] and tuple(r["gaze"])} for r in stored["frames"]]
             records = {r["name"]: FrameRecord(**r) for r in found}
+            budget = stored.get("budget")
+            if budget is not None and not (isinstance(budget, int) and budget > 0):
+                raise ValueError(f"budget {budget!r}")
         except (ValueError, KeyError, TypeError) as error:
             raise FileExistsError(
                 f"{path} is damaged ({error}); remove it and the frames beside it, and they are drawn again."
@@ -68,6 +73,7 @@ class FrameFolder:
             raise FileExistsError(
                 f"{self.folder} holds frames of other settings; name another --output-dir, or remove that folder."
             )
+        self.budget = budget
         return {name: record for name, record in records.items() if self.path(name).is_file()}
 
     def path(self, name: str) -> Path:
@@ -76,10 +82,12 @@ class FrameFolder:
 
     def add(self, record: FrameRecord, picture: Float[np.ndarray, "h w 3"]) -> None:
         """Write the record of all frames so far and then this one, each in one piece."""
+        self.folder.mkdir(parents=True, exist_ok=True)
         image = to_uint8(picture)
         self.records[record.name] = record
         frames = [vars(r) for r in self.records.values()]
-        text = json.dumps({"key": self._key, "settings": self._settings, "frames": frames}, indent=1, default=str)
+        stored = {"key": self._key, "settings": self._settings, "budget": self.budget, "frames": frames}
+        text = json.dumps(stored, indent=1, default=str)
         # first, so that a PNG in a folder without it is not ours; one that is recorded and not there is drawn again
         with _in_one_piece(self.folder / RECORD) as partial:
             partial.write_text(text + "\n", encoding="utf-8")

@@ -55,9 +55,9 @@ def run_render(options: RenderOptions, console: "Console") -> None:
         gazes = _gazes(options, len(shot.cameras))
         rate = _rate(options, shot)
         _check_level(options, scene)
-        look = _look(options, amount, scene, shot, console)
         files = [f"{name}.png" for name in shot.names] + [VIDEO] * (rate is not None)
         folder = FrameFolder(options.output_dir, _settings(options), files)
+        look = _look(options, amount, scene, shot, folder, console)
     except (ValueError, SegmenterError) as error:
         raise CommandError(str(error)) from error
     try:
@@ -80,6 +80,8 @@ def _check(options: RenderOptions) -> Amount | None:
     """Refuse what makes no sense for any scene, before one is loaded; the budget."""
     if options.level is not None:
         LevelCut(options.level)
+    if options.detail is not None and not 0 < options.detail < float("inf"):
+        raise ValueError(f"--detail {options.detail:g}: give a number above 0 (1 is the scene as it is trained).")
     if options.size is not None:
         check_size(*options.size)
     if options.fps is not None:
@@ -111,6 +113,8 @@ def _check_pairs(options: RenderOptions) -> None:
 
 
 def _check_level(options: RenderOptions, scene: Scene) -> None:
+    if options.detail is not None and scene.gaussians.decay is None:
+        raise ValueError(f"--detail {options.detail:g}: this scene has no decay; use --level, or train clodsplat.")
     levels = int(scene.gaussians.level.max()) if len(scene.gaussians) else 0
     if options.level is None or options.level <= levels:
         return
@@ -157,7 +161,9 @@ def _settings(options: RenderOptions) -> dict[str, Any]:
     return {key: str(value) if isinstance(value, Path) else value for key, value in chosen.items()}
 
 
-def _look(options: RenderOptions, amount: Amount | None, scene: Scene, shot: Shot, console: "Console") -> Look:
+def _look(
+    options: RenderOptions, amount: Amount | None, scene: Scene, shot: Shot, folder: FrameFolder, console: "Console"
+) -> Look:
     gaussians = scene.gaussians if options.filter == "none" else find_filter(options.filter)(scene.gaussians)
     parts: list[Attenuation] = []
     if options.focus is not None:
@@ -168,11 +174,13 @@ def _look(options: RenderOptions, amount: Amount | None, scene: Scene, shot: Sho
     if options.level is not None:
         parts.append(LevelCut(options.level))
     decays = gaussians.decay is not None
-    if options.detail is not None and not decays:
-        raise ValueError(f"--detail {options.detail:g}: this scene has no decay; use --level, or train clodsplat.")
-    count = None
-    if amount is not None:
-        count = _count(amount, replace(scene, gaussians=gaussians), shot, console)
+    count = folder.budget
+    if count is not None:
+        said = f"budget of {amount}: at most {count:,} Gaussians per view, as in the frames that are there"
+        console.print(said, soft_wrap=True)
+    elif amount is not None:
+        # a time is measured, and would come out otherwise for the frames that a second start draws
+        count = folder.budget = _count(amount, replace(scene, gaussians=gaussians), shot, console)
     if decays:
         parts.append(_decay(scene, options.detail, count))
     elif count is not None:

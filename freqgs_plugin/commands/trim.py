@@ -2,14 +2,13 @@
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from freqgs_plugin.commands.options import CommandError
 from freqgs_plugin.commands.trim_options import TrimOptions
 from freqgs_plugin.reports.bench.page import check_places, fill, read_page
-from freqgs_plugin.reports.bench.runner import check_folder
+from freqgs_plugin.reports.bench.runner import check_folder, write_all
 from freqgs_plugin.reports.bench.trained import load, quiet
 from freqgs_plugin.reports.tables import finite_json
 from freqgs_plugin.reports.trim.page import markdown, place_name, record_of, remarks, summary, trim_table
@@ -30,16 +29,19 @@ def run_trim(options: TrimOptions, console: "Console") -> None:
     """
     if not (math.isfinite(options.max_loss_db) and options.max_loss_db >= 0):
         raise CommandError(f"max-loss-db is {options.max_loss_db:g}; give a loss of PSNR in dB, 0 or more.")
+    written: list[Path] = []
     try:
-        _trim(options, console)
+        _trim(options, console, written)
     except ValueError as error:
         raise CommandError(str(error)) from error
     except KeyboardInterrupt:
-        console.print("Stopped. Nothing was written.")
+        what = f"{written[0]} is complete, and no more was written." if written else "Nothing was written."
+        console.print(f"Stopped. {what}", soft_wrap=True, highlight=False, markup=False)
         raise
 
 
-def _trim(options: TrimOptions, console: "Console") -> None:
+def _trim(options: TrimOptions, console: "Console", written: list[Path]) -> None:
+    """`written` then holds the new run's config.yml."""
     run = load(options.load_config)
     # loading keeps quiet what nerfstudio says as it is imported
     from freqgs_plugin.studio.run_files import latest_checkpoint
@@ -55,9 +57,8 @@ def _trim(options: TrimOptions, console: "Console") -> None:
         views = run.num_views("train"), run.num_views("test")
     if not views[0]:
         raise CommandError(f"{options.load_config}: there are no training views to measure on.")
-    page = None if options.docs is None else read_page(options.docs)
-    if page is not None:
-        check_places(page, [place_name(run)], options.docs)
+    if options.docs is not None:
+        check_places(read_page(options.docs), [place_name(run)], options.docs)
     with console.status("Trimming") as status:
         trimmer = Trimmer(
             run, options.max_loss_db, lambda draft: checkpoint_bytes(run, draft), lambda what: status.update(what)
@@ -74,6 +75,7 @@ def _trim(options: TrimOptions, console: "Console") -> None:
         "trim.md": f"# {old.name}, trimmed\n\n{text}",
     }
     config = write_trimmed(run, steps[-1].draft, old, folder.absolute(), more)
+    written.append(config)
     if options.docs is not None:
         _fill(options.docs, place_name(run), _with_circumstances(text, record))
     console.print(f"{config}", soft_wrap=True, highlight=False, markup=False)
@@ -99,7 +101,6 @@ def _with_circumstances(text: str, record: dict[str, Any]) -> str:
 
 def _fill(path: Path, name: str, text: str) -> None:
     """The page as it is now, with the run's part made anew; in one piece."""
-    page = fill(read_page(path), name, text)
-    partial = path.with_name(f".{path.name}")
-    partial.write_text(page, encoding="utf-8")
-    os.replace(partial, path)
+    page = read_page(path)
+    check_places(page, [name], path)
+    write_all({path: fill(page, name, text).encode()})

@@ -29,10 +29,11 @@ def focus(load_config: Path, options: Options = BenchOptions()) -> None:  # noqa
     """
     from rich.console import Console
 
-    from freqgs_plugin.reports.bench.focus import focus_bench
-    from freqgs_plugin.reports.bench.runner import run_bench
+    from freqgs_plugin.reports.bench.focus import TABLES, focus_bench
+    from freqgs_plugin.reports.bench.runner import check_options, run_bench
     from freqgs_plugin.reports.bench.trained import load
 
+    check_options(options, TABLES)
     bench = focus_bench(options, subject_of(load(load_config)))
     # tables are not folded to the 80 columns that a file or a pipe would have
     console = Console() if sys.stdout.isatty() else Console(width=200)

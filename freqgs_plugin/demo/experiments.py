@@ -34,8 +34,9 @@ def clod(options: ClodFlags = ClodOptions()) -> None:  # noqa: B008
     Trains many runs, one at a time: hours for the defaults on a CPU. Whatever is finished is kept, and the same command
     goes on from there.
     """
-    from freqgs_plugin.reports.experiments.runner import run_clod
+    from freqgs_plugin.reports.experiments.runner import check_clod, run_clod
 
+    check_clod(options)
     run_clod(options, *_laboratory(options))
 
 
@@ -45,8 +46,9 @@ def claims(options: ClaimsFlags = ClaimsOptions()) -> None:  # noqa: B008
     Trains 18 runs for each scene and seed, one at a time: hours on a CPU. Whatever is finished is kept, and the same
     command goes on from there.
     """
-    from freqgs_plugin.reports.experiments.claims_runner import run_claims
+    from freqgs_plugin.reports.experiments.claims_runner import check_claims, run_claims
 
+    check_claims(options, [folder.resolve().name for folder in options.scenes] + ["demo"] * options.demo)
     run_claims(options, *_laboratory(options))
 
 
@@ -90,6 +92,7 @@ def demo_scene(options: TrialOptions) -> "ExperimentScene":
     """The demo scene, ray-traced unless it is there, with a camera that goes from 0.3 to 3.1 m."""
     from freqgs_plugin.demo.dataset import MANIFEST, SceneOptions, write_scene
     from freqgs_plugin.demo.scene import build_world, zoom_path
+    from freqgs_plugin.reports.experiments.store import alone
     from freqgs_plugin.reports.experiments.training import ExperimentScene
 
     width, height = options.size
@@ -102,7 +105,10 @@ def demo_scene(options: TrialOptions) -> "ExperimentScene":
     complete = written == identity and (folder / "sparse" / "0" / "points3D.bin").is_file()
     # a page alone needs no photographs
     if not complete and not options.page_only:
-        write_scene(folder, scene)
+        options.output_dir.mkdir(parents=True, exist_ok=True)
+        # another start in the same folder would find it half written, and remove it
+        with alone(options.output_dir):
+            write_scene(folder, scene)
     path = zoom_path(build_world(scene.seed), options.frames + 1, width, height)
     return ExperimentScene("demo", folder, json.dumps(identity, sort_keys=True), tuple(path))
 

@@ -35,17 +35,22 @@ def run_tool(*arguments: str | Path, folder: Path | None = None) -> None:
         )
     except subprocess.TimeoutExpired as error:
         raise SplatFileError(f"{NAME} was stopped after {_SECONDS} s; the scene may be too large for it.") from error
+    except OSError as error:
+        raise SplatFileError(f"{tool} cannot be run ({error.strerror}); install it anew with `{INSTALL}`.") from error
     if done.returncode != 0:
         said = " ".join((done.stderr + done.stdout).split())[-400:]
         raise SplatFileError(f"`{NAME} {' '.join(command[1:])}` failed with status {done.returncode}: {said}")
 
 
 def tool_version() -> str:
-    """As the tool tells it."""
+    """As the tool tells it; "unknown" where it does not."""
     tool = find_tool()
     if tool is None:
         return "not installed"
-    done = subprocess.run([tool, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    try:
+        done = subprocess.run([tool, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return "unknown"
     return (done.stdout + done.stderr).strip().splitlines()[-1] if (done.stdout + done.stderr).strip() else "unknown"
 
 

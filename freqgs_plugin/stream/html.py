@@ -23,18 +23,24 @@ def write_html(scene: StreamScene, path: Path, options: StreamOptions | None = N
         OSError: the file cannot be written.
     """
     stream = encode_stream(scene, options or StreamOptions())
-    if len(stream.data) > MOST_BYTES:
-        raise StreamError(
-            f"{len(stream.data) / 2**20:.0f} MiB are too much for one HTML file (at most {MOST_BYTES // 2**20}); write "
-            "a stream and serve it (`freqgs serve`), or choose the variant small."
-        )
+    text = html_text(stream)
     with folder_for(path):
-        replace_file(path, html_text(stream).encode())
+        replace_file(path, text.encode())
     return stream
 
 
 def html_text(stream: Stream) -> str:
-    """The page with its styles, scripts and the stream inside."""
+    """The page with its styles, scripts and the stream inside.
+
+    Raises:
+        StreamError: it is too large for one file.
+    """
+    if len(stream.data) > MOST_BYTES:
+        smaller = "" if stream.manifest.variant == "small" else ", or choose a smaller variant"
+        raise StreamError(
+            f"{len(stream.data) / 2**20:.0f} MiB are too much for one HTML file (at most {MOST_BYTES // 2**20}); write "
+            f"a stream and serve it (`freqgs serve`){smaller}."
+        )
     page = (PAGE / "index.html").read_text(encoding="utf-8")
     page = page.replace(
         '<meta charset="utf-8">',

@@ -89,7 +89,10 @@ def encode_stream(scene: StreamScene, options: StreamOptions) -> Stream:
         raise StreamError("the scene has no Gaussians; there is nothing to stream.")
     decays = gaussians.decay is not None
     if decays and not scene.scene_distance:
-        raise StreamError("the Gaussians fade with distance, but the scene's distance is not known: name the run.")
+        raise StreamError(
+            "the Gaussians fade with distance, but the scene's distance is not known, which a PLY does not say. Stream "
+            "the run: `freqgs export --load-config RUN/config.yml --format stream`."
+        )
     drawing = _drawing(scene)
     gaussians = gaussians.select(_order(scene, drawing))
     columns = columns_of(gaussians)

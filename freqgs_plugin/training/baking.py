@@ -43,12 +43,12 @@ _TURN = math.radians(3.0)
 """standard deviation of the jittered cameras' turns, radians"""
 
 
-def signed_refusal(levels: int) -> str:
-    """Why a scene with signed residuals is not written as plain Gaussians, and what to do."""
+def signed_refusal(levels: int, kind: str = "ply") -> str:
+    """Why a scene with signed residuals is not written as plain Gaussians, and what to do to have that format."""
     return (
         f"this scene has {levels} levels with signed residual colours (in [-1, inf)). A 3DGS PLY cannot hold them: "
         "viewers clamp each Gaussian's colour at 0, and the picture would be wrong. Bake them into plain colours with "
-        "`freqgs export --format ply --bake`, which states what that loses; or train with "
+        f"`freqgs export --format {kind} --bake`, which states what that loses; or train with "
         "`--pipeline.model.signed-residuals False` to export a scene of several levels as it is."
     )
 

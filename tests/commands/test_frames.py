@@ -56,7 +56,18 @@ def stop(path, image):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"frames": [{"name": "a"}]}', '{"frames": 3}'])
+def test_a_budget_is_kept_with_its_frames(tmp_path):
+    folder = FrameFolder(tmp_path, {"budget": "16ms"})
+    assert folder.budget is None
+    folder.budget = 1234
+    folder.add(FrameRecord("a", 10, 1.5), picture())
+    assert FrameFolder(tmp_path, {"budget": "16ms"}).budget == 1234
+
+
+BAD_BUDGET = '{"frames": [], "budget": "many"}'
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"frames": [{"name": "a"}]}', '{"frames": 3}', BAD_BUDGET])
 def test_a_damaged_record_is_named(tmp_path, content):
     (tmp_path / RECORD).write_text(content)
     with pytest.raises(FileExistsError, match="damaged"):

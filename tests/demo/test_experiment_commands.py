@@ -9,6 +9,7 @@ from freqgs_plugin import cli
 from freqgs_plugin.demo import experiments, training
 from freqgs_plugin.reports.experiments import ablation
 from freqgs_plugin.reports.experiments.options import ClodOptions, ExperimentError
+from freqgs_plugin.reports.experiments.store import alone
 from freqgs_plugin.reports.experiments.training import ExperimentScene, Trial
 from freqgs_plugin.training.presets import CLODSPLAT_PAPER, LAPSPLAT_PAPER, PLAIN
 
@@ -80,6 +81,33 @@ def test_folders_that_are_no_scenes_are_refused(tmp_path, capsys):
     assert stop.value.code == 1 and "neither a COLMAP" in capsys.readouterr().err
     (tmp_path / "transforms.json").touch()
     assert experiments.parser_of(tmp_path)[0] == "nerfstudio-data"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("claims", "--only", "A-z"), "--only A-z: choose among A-a"),
+        (("claims", "--docs", "PAGE"), "no one place for the table 'claims-A demo'"),
+        (
+            ("clod", "--docs", "PAGE"),
+            "is no page that this command wrote (it would begin with '# clodsplat, measured')",
+        ),
+    ],
+)
+def test_what_is_mistyped_is_told_before_a_scene_is_made(tmp_path, capsys, arguments, message):
+    page = tmp_path / "page.md"
+    page.write_text("# My notes\n")
+    given = [str(page) if word == "PAGE" else word for word in arguments]
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["experiment", *given, "--output-dir", str(tmp_path / "out")])
+    assert stop.value.code == 1 and message in " ".join(capsys.readouterr().err.split())
+    assert [path.name for path in tmp_path.iterdir()] == ["page.md"] and page.read_text() == "# My notes\n"
+
+
+def test_a_demo_scene_is_not_made_where_another_start_works(tmp_path):
+    with alone(tmp_path), pytest.raises(ExperimentError, match="another `freqgs experiment` works in"):
+        experiments.demo_scene(ClodOptions(tmp_path, views=2, size=(24, 16), frames=10))
+    assert not (tmp_path / "scenes").exists()
 
 
 def test_the_demo_scene_is_made_once_and_zooms_tenfold(tmp_path):

@@ -174,6 +174,15 @@ def test_a_trained_view_is_measured_with_the_runs_settings(tmp_path):
     assert accuracy.backend_table(rows).note.startswith("*trained view*: 60 Gaussians, 40x30 px")
 
 
+@pytest.mark.parametrize("name", ["savings", "apps", "stream", "focus"])
+def test_a_page_without_its_places_is_told_before_a_run_is_loaded(tmp_path, capsys, name):
+    page = tmp_path / "page.md"
+    page.touch()
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["bench", name, "--load-config", str(tmp_path / "config.yml"), "--docs", str(page)])
+    assert stop.value.code == 1 and "has no one place for the table" in capsys.readouterr().err
+
+
 def test_a_missing_run_is_named(tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["bench", "accuracy", "--load-config", str(tmp_path / "config.yml")])

@@ -408,7 +408,7 @@ def test_what_is_left_out_is_told_with_what_more_would_buy(tmp_path):
     (table,) = (t for t in tables(record, []) if t.title == "Left out")
     assert table.cells()[1] == ["plain", "levels", "level 2 gained 0.1 dB", "-"] and len(table.cells()) == 4
     (tmp_path / "trim.json").write_text("{")
-    with pytest.raises(ValueError, match=r"trim\.json is damaged"):
+    with pytest.raises(ReportError, match=r"trim\.json is damaged"):
         left_out({}, tmp_path)
 
 

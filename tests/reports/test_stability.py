@@ -187,7 +187,9 @@ def test_an_interrupt_leaves_whole_groups_and_the_rows_so_far(few, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         runner.run_stability(tmp_path, None, True, said)
     text = said.export_text()
-    assert "Stopped in group compositing" in text and "--only compositing" in text
+    assert "Stopped in group compositing" in text
+    commands = [line.split("--only ")[1] for line in text.splitlines() if line.startswith("  freqgs stability")]
+    assert commands == [f"{name} --quick" for name in runner.GROUPS[1:]], "all that is not finished, as it was begun"
     assert list(json.loads((tmp_path / runner.JSON).read_text())["groups"]) == ["geometry"]
     rows = [json.loads(line) for line in (tmp_path / runner.ROWS).read_text().splitlines()]
     assert [row["case"] for row in rows] == ["doubled", "doubled", "one", "one"]

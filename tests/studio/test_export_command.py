@@ -159,6 +159,11 @@ class TestPly:
         assert "nothing is left to export" in (said := refused("export", *more, "--crop", 90, 90, 90, 91, 91, 91))
         assert "Centres reach from" in said
         assert "must be under its greatest" in refused("export", *more, "--crop", 1, 0, 0, 0, 1, 1)
+        raw = load_run(plain_run).raw
+        fine = raw.means[raw.level == 3].double()
+        near = [*(fine[0] - 1e-7).tolist(), *(fine[0] + 1e-7).tolist()]
+        said = refused("export", *more, "--level", 1, "--crop", *near)
+        assert "1 are of levels above 1" in said and "lie outside of the crop" in said
         said = freqgs("export", *more, "--crop", -0.5, -5, -5, 5, 5, 5)
         written = rows(tmp_path / "splat.ply")
         assert "lie outside of the crop" in said and written["x"].min() >= -0.5
@@ -212,7 +217,8 @@ class TestDecay:
 class TestLevels:
     def test_signed_round_trip_is_exact(self, trained, tmp_path, freqgs, refused, no_tool):
         more = ("--load-config", trained, "--output-dir", tmp_path, "--format", "levels")
-        assert "signed residual" in refused("export", *more)
+        assert "`freqgs export --format levels --bake`" in refused("export", *more)
+        assert "--level 1 leave one level" in refused("export", *more, "--level", 1)
         said = freqgs("export", *more, "--bake", "--bake-steps", 20)
         content = manifest(tmp_path / "levels" / "manifest.json")
         names = ["prefix_1.ply", "prefix_2.ply", "prefix_3.ply", "level_1.ply", "level_2.ply", "level_3.ply"]

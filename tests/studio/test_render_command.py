@@ -134,6 +134,19 @@ def test_detail_and_time_of_a_scene_with_decay(faded, tmp_path, render):
     assert "measured here:" in text
 
 
+def test_a_budget_of_time_is_measured_once_for_a_folder(faded, tmp_path, monkeypatch, render):
+    arguments = ("--load-config", faded, "--output-dir", tmp_path / "out", "--budget", "1s")
+    render(*arguments)
+    before = frames(tmp_path / "out")
+    next((tmp_path / "out").glob("*.png")).unlink()
+    monkeypatch.setattr("freqgs_plugin.commands.render.calibrate", None)
+    text = render(*arguments)
+    assert "as in the frames that are there" in text and "measured here:" not in text
+    assert {name: r["drawn"] for name, r in frames(tmp_path / "out").items()} == {
+        name: r["drawn"] for name, r in before.items()
+    }
+
+
 def test_a_budget_holds_the_scale_that_decays_were_trained_for(faded, tmp_path, render):
     """Beyond it everything fades; what shows most stays instead, as in the viewer."""
     run = load_run(faded)
@@ -182,7 +195,8 @@ def test_focus_from_masks_and_from_a_box(trained, tmp_path, render):
     [
         ((), "nothing to draw"),
         (("--load-config", "nowhere.yml"), "nowhere.yml is no file"),
-        (("--load-config", "RUN", "--detail", "3"), "no decay"),
+        (("--load-config", "RUN", "--detail", "3"), "--detail 3: this scene has no decay"),
+        (("--load-config", "FADED", "--detail", "-1"), "--detail -1: give a number above 0"),
         (("--level", "-1"), "level is -1"),
         (("--budget", "0"), "at least one"),
         (("--gaze", "2,2"), "outside of the image"),
@@ -209,7 +223,10 @@ def test_focus_from_masks_and_from_a_box(trained, tmp_path, render):
         (("--load-config", "RUN", "--focus", "nowhere:1,2"), "the view 'nowhere'"),
         (("--load-config", "RUN", "--focus", "view_001:1,2,3"), "3 numbers"),
         (("--load-config", "RUN", "--focus", "view_001:900,2"), "lies outside of the 80x64 image"),
-        (("--load-config", "RUN", "--focus", "text:ball", "--segmenter-weights", "nowhere"), "given with --seg"),
+        (
+            ("--load-config", "RUN", "--focus", "text:ball", "--segmenter-weights", "nowhere"),
+            "with a saved model with --segmenter-weights",
+        ),
     ],
 )
 def test_what_cannot_be_drawn_is_said(trained, faded, tmp_path, monkeypatch, capsys, arguments, message):

@@ -20,6 +20,7 @@ from freqgs_plugin.reports.filters import STEP, FilterRow, draw_filters, spread
 from freqgs_plugin.reports.timing import measure
 from freqgs_plugin.types import Gaussians
 
+TABLES = ("foveation", "filters", "geometry")
 POINTS = 100_000
 QUICK_POINTS = 2_000
 SEED = 0
@@ -68,7 +69,7 @@ def apps_bench(options: BenchOptions, subject: AppSubject) -> Bench:
         tables = [foveation_table(rows), filters_table(filtered), geometry_table(found)]
         return Measured(tables, {"points": SEED}, foveation_figure(rows))
 
-    return Bench("apps", ("foveation", "filters", "geometry"), len(sizes) + 2, run)
+    return Bench("apps", TABLES, len(sizes) + 2, run)
 
 
 def filters_table(rows: Sequence[FilterRow]) -> BenchTable:

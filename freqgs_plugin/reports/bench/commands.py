@@ -73,11 +73,12 @@ def savings(load_config: Path, options: Options = BenchOptions()) -> None:  # no
         load_config: config.yml of a trained run.
         options: where to write, and how to measure.
     """
-    from freqgs_plugin.reports.bench.runner import run_bench
-    from freqgs_plugin.reports.bench.savings import savings_bench
+    from freqgs_plugin.reports.bench.runner import check_options, run_bench
+    from freqgs_plugin.reports.bench.savings import TABLES, savings_bench
     from freqgs_plugin.reports.bench.savings_cases import subject_of
     from freqgs_plugin.reports.bench.trained import load, views_of
 
+    check_options(options, TABLES)
     run = load(load_config)
     bench = savings_bench(options, subject_of(run, views_of(run)[0]))
     run_bench(bench, options, _console(), "--load-config", "RUN/config.yml")
@@ -90,10 +91,11 @@ def apps(load_config: Path, options: Options = BenchOptions()) -> None:  # noqa:
         load_config: config.yml of a trained run of several levels.
         options: where to write, and how to measure.
     """
-    from freqgs_plugin.reports.bench.apps import app_subject, apps_bench
-    from freqgs_plugin.reports.bench.runner import run_bench
+    from freqgs_plugin.reports.bench.apps import TABLES, app_subject, apps_bench
+    from freqgs_plugin.reports.bench.runner import check_options, run_bench
     from freqgs_plugin.reports.bench.trained import load, views_of
 
+    check_options(options, TABLES)
     run = load(load_config)
     bench = apps_bench(options, app_subject(run, views_of(run)))
     run_bench(bench, options, _console(), "--load-config", "RUN/config.yml")
@@ -111,12 +113,13 @@ def stream(
         names: what the runs are called in the tables; otherwise as their experiments.
         options: where to write, and how to measure.
     """
-    from freqgs_plugin.reports.bench.runner import run_bench
-    from freqgs_plugin.reports.bench.stream import stream_bench
+    from freqgs_plugin.reports.bench.runner import check_options, run_bench
+    from freqgs_plugin.reports.bench.stream import TABLES, stream_bench
     from freqgs_plugin.reports.bench.stream_measure import subject_of_run
 
     if names and len(names) != len(load_config):
         raise BenchError(f"--names holds {len(names)} names for {len(load_config)} runs; give one for each, or none.")
+    check_options(options, TABLES)
     given = names or (None,) * len(load_config)
     subjects = [subject_of_run(path, name) for path, name in zip(load_config, given, strict=True)]
     arguments = ["--load-config", *["RUN/config.yml"] * len(load_config), *(["--names", *names] if names else [])]

@@ -10,6 +10,7 @@ from freqgs_plugin.reports.bench.runner import Bench, Measured, Tick
 from freqgs_plugin.reports.bench.tables import BenchTable, Row, milliseconds, number
 from freqgs_plugin.reports.timing import timing_of
 
+TABLES = ("focus", "focus-times")
 FEW = 4
 """views that vote in the ways called so"""
 QUICK = 2
@@ -28,7 +29,7 @@ def focus_bench(options: BenchOptions, subject: FocusSubject) -> Bench:
             rows.append({"object": name, "pixels": float(np.mean(pixels)), **outcomes(subject, index, FEW)})
         return Measured([focus_table(rows, subject), time_table(rows, subject)])
 
-    return Bench("focus", ("focus", "focus-times"), len(objects), measure)
+    return Bench("focus", TABLES, len(objects), measure)
 
 
 def focus_table(rows: Sequence[Row], subject: FocusSubject) -> BenchTable:

@@ -67,11 +67,7 @@ def run_bench(bench: Bench, options: BenchOptions, console: "Console", *argument
         BenchError: the page lacks a place, or there are too few threads.
         KeyboardInterrupt: passed on, after a message.
     """
-    page = None
-    if options.docs is not None:
-        page = read_page(options.docs)
-        check_places(page, bench.tables, options.docs)
-    check_folder(options.output_dir)
+    check_options(options, bench.tables)
     load = _load()
     with use_threads(options.threads):
         start = time.perf_counter()
@@ -86,13 +82,25 @@ def run_bench(bench: Bench, options: BenchOptions, console: "Console", *argument
             "seconds": round(time.perf_counter() - start, 1),
         }
     assert [table.name for table in measured.tables] == list(bench.tables)
-    files = _files(bench, measured, record, options, page)
+    files = _files(bench, measured, record, options)
     write_all(files)
     for table in measured.tables:
         console.print(table.rich())
     for line in (*measured.remarks, *(f"{path}" for path in files)):
         console.print(line, soft_wrap=True, highlight=False, markup=False)
     return measured
+
+
+def check_options(options: BenchOptions, tables: Sequence[str]) -> None:
+    """What can be refused before anything is loaded or measured.
+
+    Raises:
+        BenchError: the page lacks the place of one of `tables`.
+        OSError: the folder cannot be written.
+    """
+    if options.docs is not None:
+        check_places(read_page(options.docs), tables, options.docs)
+    check_folder(options.output_dir)
 
 
 def command_line(name: str, options: BenchOptions, *arguments: str) -> list[str]:
@@ -127,9 +135,7 @@ def _measure(bench: Bench, console: "Console") -> Measured:
     return measured
 
 
-def _files(
-    bench: Bench, measured: Measured, record: dict[str, Any], options: BenchOptions, page: str | None
-) -> dict[Path, bytes]:
+def _files(bench: Bench, measured: Measured, record: dict[str, Any], options: BenchOptions) -> dict[Path, bytes]:
     """Path -> contents of everything that is written."""
     picture = f"{bench.name}.png" if measured.figure is not None else None
 
@@ -146,7 +152,10 @@ def _files(
     }
     if measured.figure is not None:
         files[out / f"{bench.name}.png"] = png(measured.figure)
-    if options.docs is not None and page is not None:
+    if options.docs is not None:
+        # it may have been edited meanwhile, or another benchmark has filled its places
+        page = read_page(options.docs)
+        check_places(page, bench.tables, options.docs)
         for i in count:
             page = fill(page, measured.tables[i].name, text(i, f"{IMAGES}/bench_"))
         files[options.docs] = page.encode()

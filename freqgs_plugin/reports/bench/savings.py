@@ -9,6 +9,7 @@ from freqgs_plugin.reports.bench.savings_cases import Saving, Subject, savings_o
 from freqgs_plugin.reports.bench.tables import BenchTable, Row, milliseconds, number, ratio
 from freqgs_plugin.reports.bench.workloads import IMAGE_SEED
 
+TABLES = ("savings",)
 PATIENCE = 20.0
 """for the rounds of one saving, seconds"""
 
@@ -24,7 +25,7 @@ def savings_bench(options: BenchOptions, subject: Subject) -> Bench:
             rows.append(saving_row(saving, options))
         return Measured([saving_table(rows, subject)], {"image gradient": IMAGE_SEED})
 
-    return Bench("savings", ("savings",), len(savings), measure)
+    return Bench("savings", TABLES, len(savings), measure)
 
 
 def saving_row(saving: Saving, options: BenchOptions) -> Row:

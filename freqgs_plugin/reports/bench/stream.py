@@ -29,6 +29,7 @@ from freqgs_plugin.stream.write import Stream, StreamOptions, encode_stream, sav
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+TABLES = ("stream-curve", "stream-variants", "stream-lines")
 LINES = (1.0, 10.0, 100.0)
 """Mbit/s"""
 
@@ -66,7 +67,7 @@ def stream_bench(options: BenchOptions, subjects: Sequence[StreamSubject]) -> Be
         return Measured(tables, figure=figure(curves, plys, found))
 
     steps = len(subjects) * (len(variants) + 1 + len(lines))
-    return Bench("stream", ("stream-curve", "stream-variants", "stream-lines"), steps, measure)
+    return Bench("stream", TABLES, steps, measure)
 
 
 def variant_row(subject: StreamSubject, variant: str, ply_bytes: int) -> tuple[Row, Stream]:

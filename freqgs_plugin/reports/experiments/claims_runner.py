@@ -50,8 +50,7 @@ def run_claims(options: ClaimsOptions, scenes: Sequence[ExperimentScene], tools:
         ExperimentError: `page_only`, and nothing is finished, or nothing of `only`; `only` names what there is not.
         BenchError: the page of `docs` lacks the place of a scene.
     """
-    names = _chosen(options.only)
-    _check_page(options.docs, scenes, names)
+    names = check_claims(options, [scene.name for scene in scenes])
     out = options.output_dir
     check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -99,13 +98,21 @@ def _chosen(only: Iterable[str]) -> list[str]:
     return [name for name in MEASURED if not wanted or name in wanted]
 
 
-def _check_page(docs: Path | None, scenes: Sequence[ExperimentScene], names: Sequence[str]) -> None:
-    """Before hours of work."""
-    if docs is not None:
-        page = read_page(docs)
+def check_claims(options: ClaimsOptions, scenes: Sequence[str]) -> list[str]:
+    """What can be refused before hours of work, and before there are scenes; the names that `only` chooses.
+
+    Raises:
+        ExperimentError: `only` names what there is not.
+        BenchError: the page of `docs` lacks the place of one of `scenes`.
+        OSError: nothing can be written beside the page.
+    """
+    names = _chosen(options.only)
+    if options.docs is not None:
         parts = dict.fromkeys(place_of(name) for name in names)
-        check_places(page, [f"{part} {scene.name}" for scene in scenes for part in parts], docs)
-        check_folder(docs.parent)
+        places = [f"{part} {scene}" for scene in scenes for part in parts]
+        check_places(read_page(options.docs), places, options.docs)
+        check_folder(options.docs.parent)
+    return names
 
 
 def _report(

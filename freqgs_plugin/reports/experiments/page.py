@@ -11,6 +11,8 @@ from freqgs_plugin.reports.experiments.section import Part, Results
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+TITLE = "# clodsplat, measured"
+
 
 @dataclass(frozen=True)
 class Shown:
@@ -63,7 +65,7 @@ def markdown_page(record: Mapping[str, Any], shown: Sequence[Shown], pictures: s
     goals = [goal for each in shown for goal in each.goals()]
     steps, seeds = record["options"]["steps"], record["seeds"]
     parts = [
-        "# clodsplat, measured",
+        TITLE,
         "This page is written by `freqgs experiment clod` (see [Experiments](experiments.md)). Nothing is typed in.",
         circumstances(record),
         f"Every run has {steps:,} steps. Every eighth view is held out. Seeds: {', '.join(map(str, seeds))}"

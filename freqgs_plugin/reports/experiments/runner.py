@@ -6,12 +6,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from freqgs_plugin.reports.bench.page import read_page
 from freqgs_plugin.reports.bench.runner import IMAGES, check_folder, png, write_all
 from freqgs_plugin.reports.experiments import ablation, budget, curve, pops, sigma
 from freqgs_plugin.reports.experiments.goals import goal_table
 from freqgs_plugin.reports.experiments.lab import Lab, Missing, Tools
 from freqgs_plugin.reports.experiments.options import SECTIONS, ClodOptions, ExperimentError, TrialOptions, command_line
-from freqgs_plugin.reports.experiments.page import Shown, markdown_page
+from freqgs_plugin.reports.experiments.page import TITLE, Shown, markdown_page
 from freqgs_plugin.reports.experiments.progress import Bars, Silent
 from freqgs_plugin.reports.experiments.section import Part
 from freqgs_plugin.reports.experiments.store import Store, alone
@@ -31,10 +32,11 @@ def run_clod(options: ClodOptions, scenes: Sequence[ExperimentScene], tools: Too
 
     Raises:
         KeyboardInterrupt: passed on, after a message on how to go on.
+        ExperimentError: `page_only`, and nothing is finished; `docs` is another page.
     """
     out = options.output_dir
-    for folder in (out, *([options.docs.parent] if options.docs is not None else [])):
-        check_folder(folder)
+    check_clod(options)
+    check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     store, log = Store(out / "steps"), out / "load.log"
     if options.page_only:
@@ -52,6 +54,24 @@ def run_clod(options: ClodOptions, scenes: Sequence[ExperimentScene], tools: Too
     for path in files:
         _say(console, str(path))
     return shown
+
+
+def check_clod(options: ClodOptions) -> None:
+    """What can be refused before hours of work. The whole page is written, so what is there must be an earlier one.
+
+    Raises:
+        ExperimentError: it is another page.
+        OSError: nothing can be written beside it.
+    """
+    if options.docs is None:
+        return
+    page = read_page(options.docs)
+    if page and not page.startswith(TITLE):
+        raise ExperimentError(
+            f"{options.docs} is no page that this command wrote (it would begin with '{TITLE}'), and all of it would "
+            "be replaced; name another --docs"
+        )
+    check_folder(options.docs.parent)
 
 
 Report = tuple[list[Shown], Mapping[Path, bytes]]

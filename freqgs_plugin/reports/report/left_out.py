@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from freqgs_plugin.reports.report.options import ReportError
 from freqgs_plugin.training.choose_levels import said_of_levels
 
 TRIMMED = "trim.json"
@@ -18,7 +19,7 @@ def left_out(choice: dict[str, Any], folder: Path) -> list[dict[str, str]]:
         folder: of the run.
 
     Raises:
-        ValueError: its trim.json is damaged.
+        ReportError: its trim.json is damaged.
     """
     rows = [_row("levels", text) for text in said_of_levels(choice)]
     file = folder / TRIMMED
@@ -33,7 +34,7 @@ def _trimmed(file: Path) -> list[dict[str, str]]:
         steps = [_row(step["step"], step["done"] or "nothing", step["more"]) for step in record["steps"][1:]]
         return [_row("trimmed", record["summary"]), *steps]
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{file} is damaged ({error!r}): remove it, and the report goes without it.") from error
+        raise ReportError(f"{file} is damaged ({error!r}): remove it, and the report goes without it.") from error
 
 
 def _row(what: str, done: str, more: str | None = "") -> dict[str, str]:

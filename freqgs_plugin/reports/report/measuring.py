@@ -28,6 +28,8 @@ def measure_report(
 ) -> tuple[dict[str, Any], list[list[Subset]]]:
     """The record (JSON values but for infinite numbers) and, run by run, the subsets that it describes."""
     load = round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
+    # a damaged file is told before all the work
+    missing = [left_out(of.run.model.level_choice(), of.config.resolve().parent) for of in runs]
     drawn = [_subsets(of, options, bars) for of in runs]
     bars.advance()
     lpips = lpips_if_there(runs[0].run.gaussians.means.device)
@@ -57,9 +59,9 @@ def measure_report(
                 "full": full,
                 "training": _training(of, full, log),
                 "health": health(of.run, full["clamped"], log),
-                "left_out": left_out(of.run.model.level_choice(), of.config.resolve().parent),
+                "left_out": rows,
             }
-            for of, each, points, full, log in zip(runs, drawn, measured, whole, logs, strict=True)
+            for of, each, points, full, log, rows in zip(runs, drawn, measured, whole, logs, missing, strict=True)
         ],
     }
     return record, drawn

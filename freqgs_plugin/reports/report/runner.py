@@ -38,10 +38,8 @@ def run_report(options: ReportOptions, console: "Console") -> dict[str, Any]:
         OSError: files that are not there, or an output folder that cannot be used.
         KeyboardInterrupt: passed on, after a message.
     """
-    page = None
     if options.docs is not None:
-        page = read_page(options.docs)
-        check_places(page, [PLACE], options.docs)
+        check_places(read_page(options.docs), [PLACE], options.docs)
         check_folder(options.docs.parent / IMAGES)
     check_output(options.output_dir)
     files: dict[str, bytes] = {}
@@ -56,8 +54,8 @@ def run_report(options: ReportOptions, console: "Console") -> dict[str, Any]:
             files = _files(record, shown, plots)
             files["report.html"] = html_page(record, shown, plots, drawn).encode()
         write_folder(options.output_dir, files)
-        if options.docs is not None and page is not None:
-            _fill_docs(options, page, record, shown, plots)
+        if options.docs is not None:
+            _fill_docs(options.docs, record, shown, plots)
     except KeyboardInterrupt:
         # it may have come just after the folder took its place
         written = bool(files) and _holds(options.output_dir / RECORD, files[RECORD])
@@ -87,19 +85,15 @@ def _files(record: Mapping[str, Any], shown: Sequence[BenchTable], plots: Mappin
     return files
 
 
-def _fill_docs(
-    options: ReportOptions,
-    page: str,
-    record: Mapping[str, Any],
-    shown: Sequence[BenchTable],
-    plots: Mapping[str, bytes],
-) -> None:
-    assert options.docs is not None
+def _fill_docs(docs: Path, record: Mapping[str, Any], shown: Sequence[BenchTable], plots: Mapping[str, bytes]) -> None:
     taken = [name for name in DOCS_PLOTS if name in plots]
     text = docs_part(record, shown, {name: f"{IMAGES}/{PREFIX}{name}.png" for name in taken})
-    folder = options.docs.parent / IMAGES
+    folder = docs.parent / IMAGES
+    # it may have been edited meanwhile
+    page = read_page(docs)
+    check_places(page, [PLACE], docs)
     pictures = {folder / f"{PREFIX}{name}.png": plots[name] for name in taken}
-    write_all({**pictures, options.docs: fill(page, PLACE, text).encode()})
+    write_all({**pictures, docs: fill(page, PLACE, text).encode()})
 
 
 def _png(figure: "Figure", record: Mapping[str, Any]) -> bytes:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -44,7 +45,7 @@ def run_stability(output_dir: Path, only: Group | None, quick: bool, console: "C
         if not cases:
             console.print(f"Left out, as all of it takes long: {group}.")
             continue
-        with _told(group, output_dir, console):
+        with _told(group, output_dir, only, quick, console):
             rows, seconds = _run_group(group, cases, rows_path, console)
         record = {**environment(), "quick": quick, "seconds": round(seconds, 1), "rows": [asdict(row) for row in rows]}
         save_group(output_dir, group, record)
@@ -118,15 +119,18 @@ def _run_case(case: Case) -> list[Row]:
 
 
 @contextmanager
-def _told(group: Group, output_dir: Path, console: "Console") -> Iterator[None]:
+def _told(group: Group, output_dir: Path, only: Group | None, quick: bool, console: "Console") -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
         console.print(
-            f"Stopped in group {group}. Rows so far are in {output_dir / ROWS}; {output_dir / JSON} holds whole groups "
-            f"only. To go on: freqgs stability --output-dir {output_dir} --only {group}",
+            f"Stopped in group {group}. Its rows so far are in {output_dir / ROWS}, until the next start; "
+            f"{output_dir / JSON} holds whole groups only. To go on:",
             soft_wrap=True, highlight=False, markup=False,
         )  # fmt: skip
+        for name in (only,) if only is not None else GROUPS[GROUPS.index(group) :]:
+            command = ["freqgs", "stability", "--output-dir", str(output_dir), "--only", name, *["--quick"] * quick]
+            console.print(f"  {shlex.join(command)}", soft_wrap=True, highlight=False, markup=False)
         raise
 
 
