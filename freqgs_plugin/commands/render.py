@@ -176,8 +176,7 @@ def _look(
     decays = gaussians.decay is not None
     count = folder.budget
     if count is not None:
-        said = f"budget of {amount}: at most {count:,} Gaussians per view, as in the frames that are there"
-        console.print(said, soft_wrap=True)
+        console.print(f"{_allowed(amount, count, gaussians)}, as in the frames that are there", soft_wrap=True)
     elif amount is not None:
         # a time is measured, and would come out otherwise for the frames that a second start draws
         count = folder.budget = _count(amount, replace(scene, gaussians=gaussians), shot, console)
@@ -209,11 +208,16 @@ def _count(amount: Amount, scene: Scene, shot: Shot, console: "Console") -> int:
 
     degree = round((g.features_rest.shape[1] + 1) ** 0.5) - 1
     count = amount.count(degree, g.decay is not None, camera.width * camera.height, measure)
-    console.print(f"budget of {amount}: at most {count:,} Gaussians per view", soft_wrap=True)
+    console.print(_allowed(amount, count, g), soft_wrap=True)
     base = int((in_view(g, camera) & (g.level == 1)).sum())
     if count < base and int(g.level.max()) > 1:
         console.print(f"[yellow]The base alone has {base:,} in the first view: it is drawn in part.", soft_wrap=True)
     return count
+
+
+def _allowed(amount: Amount, count: int, gaussians: Gaussians) -> str:
+    most = f"at most {count:,} Gaussians per view" if count < len(gaussians) else "enough for all Gaussians"
+    return f"budget of {amount}: {most}"
 
 
 def _measured(scene: Scene, camera: Camera) -> Callable[[int, float], tuple[int, int]]:
