@@ -82,5 +82,5 @@ def _missing(weights: str | Path, allow_download: bool, before: str = "") -> Mis
         )
     return MissingWeightsError(
         f"{before}the CLIPSeg weights '{weights}' are neither a folder nor in the cache of the Hugging Face hub.",
-        "As nothing is downloaded unasked, pass weights=FOLDER with a saved model, or allow_download=True to fetch once.",
+        "As nothing is downloaded unasked, pass weights=FOLDER with a saved model, or allow_download=True.",
     )

@@ -174,12 +174,12 @@ def _look(
     if options.level is not None:
         parts.append(LevelCut(options.level))
     decays = gaussians.decay is not None
-    count = folder.budget
-    if count is not None:
-        console.print(f"{_allowed(amount, count, gaussians)}, as in the frames that are there", soft_wrap=True)
+    if amount is not None and folder.budget is not None:
+        console.print(f"{_allowed(amount, folder.budget, gaussians)}, as in the frames that are there", soft_wrap=True)
     elif amount is not None:
         # a time is measured, and would come out otherwise for the frames that a second start draws
-        count = folder.budget = _count(amount, replace(scene, gaussians=gaussians), shot, console)
+        folder.budget = _count(amount, replace(scene, gaussians=gaussians), shot, console)
+    count = None if amount is None else folder.budget
     if decays:
         parts.append(_decay(scene, options.detail, count))
     elif count is not None:
