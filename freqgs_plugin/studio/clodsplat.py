@@ -46,7 +46,7 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     """step from which opacities decay with distance (the paper)"""
     initial_decay: float = 5.0
     """sigma of every Gaussian at first, in normalised distances (ours; the paper does not say)"""
-    largest_scale: float = 5.0
+    largest_scale: float = 7.0
     """s_max: training draws its virtual distance scale from U(1, s_max) (the paper: 1, 3, 5 or 7)"""
     full_detail_every: int = 2
     """every so many steps the scale is 1 (ours); 0: only by chance (the paper)"""

@@ -46,6 +46,7 @@ LAPSPLAT_PAPER: Mapping[str, Any] = {
 """lapsplat as the paper on frequency-aware decomposition has it, where it says what it does"""
 
 CLODSPLAT_PAPER: Mapping[str, Any] = {
+    "largest_scale": 5.0,
     "full_detail_every": 0,
     "reg_gradient": "none",
     "dead_decay": "prune",

@@ -12,7 +12,7 @@ from freqgs_plugin.reports.experiments.options import TrialOptions
 from freqgs_plugin.reports.experiments.plots import COLOURS, panels
 from freqgs_plugin.reports.experiments.section import Part, Results
 from freqgs_plugin.reports.experiments.seeds import mean, shown
-from freqgs_plugin.reports.experiments.training import DEFAULT_SCALE, Training, Trial, Value
+from freqgs_plugin.reports.experiments.training import ABLATION_SCALE, Training, Trial, Value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,12 +21,12 @@ GRADIENTS = ("off", "none", "ste", "soft")
 """of L_reg; off: it has weight 0"""
 LEAST_EFFECT = 0.05
 """share by which the count at s_v = s_max has to fall for the loss to act"""
-SCALES = (1.0, DEFAULT_SCALE)
+SCALES = (1.0, ABLATION_SCALE)
 
 INTRODUCTION = f"""\
 w_s of Eq. 5 on and off, and L_reg off and on with each of the gradients of its count: `none` is the paper's formula,
-whose mask has no gradient; `ste` and `soft` are those of `reg-gradient`. All with s_max = {DEFAULT_SCALE:g}, at full
-detail and at s_v = {DEFAULT_SCALE:g}, means over the held-out views. *Against off*: the count at that s_v, relative to
+whose mask has no gradient; `ste` and `soft` are those of `reg-gradient`. All with s_max = {ABLATION_SCALE:g}, at full
+detail and at s_v = {ABLATION_SCALE:g}, means over the held-out views. *Against off*: the count at that s_v, relative to
 the row without L_reg. *without decay* is the same method with `use-decay False`."""
 
 
@@ -44,11 +44,11 @@ def name_of(weigh: bool, gradient: str) -> str:
 def trainings(trial: Trial) -> dict[str, Training]:
     """Name -> run."""
     cells = {
-        name_of(weigh, gradient): trial.clod(more=settings(weigh, gradient))
+        name_of(weigh, gradient): trial.clod(ABLATION_SCALE, more=settings(weigh, gradient))
         for weigh in (True, False)
         for gradient in GRADIENTS
     }
-    return {**cells, "without decay": trial.clod(more={"use_decay": False})}
+    return {**cells, "without decay": trial.clod(ABLATION_SCALE, more={"use_decay": False})}
 
 
 def measure(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
@@ -105,8 +105,8 @@ def tables(scene: str, results: Results) -> list[BenchTable]:
                 ("Gaussians", lambda row: shown(row["seeds"], lambda s: s["gaussians"], ",.0f")),
                 ("PSNR, full", lambda row: shown(row["seeds"], lambda s: s["full"]["psnr"])),
                 ("drawn, full", lambda row: shown(row["seeds"], lambda s: s["full"]["drawn"], ",.0f")),
-                (f"PSNR, s_v {DEFAULT_SCALE:g}", lambda row: shown(row["seeds"], reduced("psnr"))),
-                (f"drawn, s_v {DEFAULT_SCALE:g}", lambda row: shown(row["seeds"], reduced("drawn"), ",.0f")),
+                (f"PSNR, s_v {ABLATION_SCALE:g}", lambda row: shown(row["seeds"], reduced("psnr"))),
+                (f"drawn, s_v {ABLATION_SCALE:g}", lambda row: shown(row["seeds"], reduced("drawn"), ",.0f")),
                 ("against off", lambda row: row["against"]),
             ],
         )
@@ -118,7 +118,7 @@ def goals(scene: str, results: Results) -> list[Goal]:
     found = []
     for gradient in GRADIENTS[1:]:
         change = mean(results, lambda r, g=gradient: effect(r, True, g)) - 1
-        text = f"L_reg ({gradient}) acts: at least {100 * LEAST_EFFECT:.0f} % fewer drawn at s_v {DEFAULT_SCALE:g}"
+        text = f"L_reg ({gradient}) acts: at least {100 * LEAST_EFFECT:.0f} % fewer drawn at s_v {ABLATION_SCALE:g}"
         found.append(Goal(scene, text, f"{100 * change:+.1f} %", change <= -LEAST_EFFECT))
     return found
 
@@ -133,7 +133,7 @@ def figures(scene: str, results: Results) -> "dict[str, Figure]":
             y = [mean(seeds, lambda s, k=k: s[k]["psnr"]) for k in ("full", "reduced")]
             axes[0].plot(x, y, style, color=colour, marker="o", ms=4, label=name_of(weigh, gradient))
     axes[0].set(xlabel="Gaussians drawn, thousands", ylabel="PSNR, dB")
-    axes[0].set_title(f"{scene}: full detail and s_v = {DEFAULT_SCALE:g}")
+    axes[0].set_title(f"{scene}: full detail and s_v = {ABLATION_SCALE:g}")
     axes[0].legend(fontsize=7)
     return {"": figure}
 

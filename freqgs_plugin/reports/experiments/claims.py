@@ -11,7 +11,7 @@ from freqgs_plugin.reports.experiments.lab import Lab
 from freqgs_plugin.reports.experiments.options import TrialOptions
 from freqgs_plugin.reports.experiments.section import Results
 from freqgs_plugin.reports.experiments.seeds import mean, shown
-from freqgs_plugin.reports.experiments.training import DEFAULT_SCALE, Training, Trial
+from freqgs_plugin.reports.experiments.training import ABLATION_SCALE, Training, Trial
 from freqgs_plugin.training.presets import Value
 
 HALF = 0.5
@@ -249,7 +249,7 @@ def _parts_matter(scene: str, results: Results) -> Verdict:
         matter.append(lost < -EQUAL or more > 0.05 * count)
 
     def multi(name: str, figure: str) -> float:
-        return mean(results, lambda r: next(row for row in r["curve"][name] if row["scale"] == DEFAULT_SCALE)[figure])
+        return mean(results, lambda r: next(row for row in r["curve"][name] if row["scale"] == ABLATION_SCALE)[figure])
 
     lost = multi("1", "psnr") - multi("5", "psnr")
     more = multi("1", "drawn") / multi("5", "drawn") - 1
@@ -259,7 +259,7 @@ def _parts_matter(scene: str, results: Results) -> Verdict:
 
 
 def _parts(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
-    scales = curve.by_largest_scale(lab, trial, (1.0, DEFAULT_SCALE))
+    scales = curve.by_largest_scale(lab, trial, (1.0, ABLATION_SCALE))
     return {"ablation": ablation.of_cells(lab, trial, (_FULL, *_WITHOUT.values())), "curve": scales}
 
 

@@ -10,8 +10,10 @@ from typing import Any
 from freqgs_plugin.training.presets import PLAIN, Value
 from freqgs_plugin.types import Camera
 
-DEFAULT_SCALE = 5.0
-"""s_max of all runs but those of the sections curve and sigma (the paper's ablations: 5)"""
+DEFAULT_SCALE = 7.0
+"""s_max of clodsplat's default, of all runs but those of the sections curve, sigma and ablation"""
+ABLATION_SCALE = 5.0
+"""s_max of the ablation (the paper's: 5)"""
 _LATER = {"auto_psnr": "30.0", "auto_share": "0.1", "least_level_gain": "0.0", "base_share": "1.0"}
 """options that a model has got since runs were kept, with the values at which they change nothing"""
 _DOWNSCALED = re.compile(r"images_\d+$")
