@@ -83,7 +83,7 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     """radius on the screen, as a share of the longer side, above which a Gaussian is split (ours; splatfacto: 0.05)"""
     least_weight: float = 2.0
     """Gaussians whose weight over all training views is under this many pixels are removed; 0: none (ours)"""
-    detail_scales: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 5.0)
+    detail_scales: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
     """scales that are evaluated, and offered as outputs detail_1, detail_1.5 ..."""
     init_from: Path | None = None
     """Gaussians to start from: a 3DGS PLY, or a splatfacto, lapsplat or clodsplat run (its folder or config.yml);

@@ -12,7 +12,7 @@ from freqgs_plugin.rendering.base import get_rasterizer
 from freqgs_plugin.reports.experiments.lab import Lab, Tools
 from freqgs_plugin.reports.experiments.progress import Silent
 from freqgs_plugin.reports.experiments.store import Store
-from freqgs_plugin.reports.experiments.training import PLAIN, ExperimentScene
+from freqgs_plugin.reports.experiments.training import DEFAULT_SCALE, PLAIN, ExperimentScene
 
 SCENE = ExperimentScene("room", Path("room"), "what is in room")
 
@@ -64,10 +64,11 @@ class FakeTools:
         if said["method"].startswith("lapsplat") and said.get("num_levels") in (None, "auto", 5):
             return levels_run(said=[f"chosen by {said}"] if said.get("num_levels") == "auto" else ())
         decays = said["method"].startswith("clodsplat") and said.get("use_decay", True)
-        return decaying_run(said.get("largest_scale", 5.0) if decays else None)
+        return decaying_run(said.get("largest_scale", DEFAULT_SCALE) if decays else None)
 
     def defaults(self, method):
-        ours = {"largest_scale": 5.0, "use_decay": True, "weigh_scales": True, "reg_weight": 1.0, "reg_gradient": "ste"}
+        ours = {"largest_scale": DEFAULT_SCALE, "use_decay": True, "weigh_scales": True}
+        ours |= {"reg_weight": 1.0, "reg_gradient": "ste"}
         levels = {"dft_weight": 0.001, "lower_level_weight": 0.1, "signed_residuals": True}
         levels |= {"num_levels": 3, "base_share": 1.0, "level_interval": 2500, "coarse_growth_factor": 1.8}
         levels |= {"least_level_gain": 0.0}

@@ -106,8 +106,9 @@ def test_all_claims_are_measured_once_and_shown(tmp_path, monkeypatch):
         run_claims(ClaimsOptions(**{**vars(options), "page_only": True}), [SCENE], tools.tools(), console)
     found = run_claims(options, [SCENE], tools.tools(), console)
     assert {name for name, results in found["room"][1].items() if results} == {*BY_NAME, "goals", "runs", "levels"}
-    # 9 of the table of runs, 2 of one size, s_max 1, plain's coarse sibling, without w_s, without L_reg, 3 of levels
-    assert len(tools.trained) == 9 + 2 + 4 + 3
+    # 9 of the table of runs, 2 of one size, s_max 1, plain's coarse sibling, s_max 5 and that without w_s and without
+    # L_reg, 3 of levels
+    assert len(tools.trained) == 9 + 2 + 2 + 3 + 3
     assert len(tools.trained) == len({str(training) for training in tools.trained})
     page = docs.read_text(encoding="utf-8")
     whole = (tmp_path / "out" / "claims.md").read_text(encoding="utf-8")

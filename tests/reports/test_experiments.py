@@ -25,7 +25,7 @@ from freqgs_plugin.reports.experiments.measures import Changes, at_scale, change
 from freqgs_plugin.reports.experiments.options import SECTIONS, ClodOptions, ExperimentError, command_line
 from freqgs_plugin.reports.experiments.seeds import mean, shown, spread
 from freqgs_plugin.reports.experiments.selection import MostOpaque, SharedDecay
-from freqgs_plugin.reports.experiments.training import Trial, fingerprint
+from freqgs_plugin.reports.experiments.training import DEFAULT_SCALE, Trial, fingerprint
 from freqgs_plugin.reports.tables import finite_json, psnr
 
 
@@ -282,7 +282,7 @@ def test_jumps_of_a_sweep_a_dolly_and_a_switch(view):
     for path in jumps.PATHS:
         for name in jumps.variants(run):
             assert len(paths[path][name]["each"]) == 6, (path, name)
-    assert len(found["psnr"][jumps.DEFAULT]) == 7 and found["scales"][0] == 1 and found["scales"][-1] == 5
+    assert len(found["psnr"][jumps.DEFAULT]) == 7 and found["scales"][0] == 1 and found["scales"][-1] == DEFAULT_SCALE
     expected = psnr(draw(run, view.camera, at_scale(run, 1.0)).features.clamp(0, 1), view.image)
     assert found["psnr"][jumps.DEFAULT][0] == pytest.approx(expected)
 
@@ -310,7 +310,7 @@ def test_shares_and_quantiles_of_decays():
 
 def test_every_section_makes_tables_and_pictures_of_two_seeds(tmp_path):
     lab, _ = fake_lab(tmp_path)
-    options = ClodOptions(tmp_path, s_max=(1.0, 5.0), frames=4)
+    options = ClodOptions(tmp_path, s_max=(1.0, DEFAULT_SCALE), frames=4)
     for part in (curve.PART, budget.PART, pops.PART, ablation.PART, sigma.PART):
         results = [part.measure(lab, Trial(SCENE, 30, seed), options) for seed in (42, 43)]
         for table in part.tables("room", results):

@@ -21,7 +21,7 @@ from freqgs_plugin.reports.experiments.lab import Missing
 from freqgs_plugin.reports.experiments.options import ClodOptions, ExperimentError
 from freqgs_plugin.reports.experiments.runner import run_clod
 from freqgs_plugin.reports.experiments.store import Store, alone, key
-from freqgs_plugin.reports.experiments.training import Trial
+from freqgs_plugin.reports.experiments.training import DEFAULT_SCALE, Trial
 
 TRIAL = Trial(SCENE, 30, 42)
 
@@ -114,7 +114,7 @@ def test_a_training_is_done_once(tmp_path):
 def test_settings_that_equal_the_defaults_make_the_same_training(tmp_path):
     lab, tools = fake_lab(tmp_path)
     lab.config_path(TRIAL.clod())
-    lab.config_path(TRIAL.clod(5, {"reg_weight": 1.0, "reg_gradient": "ste"}))
+    lab.config_path(TRIAL.clod(7, {"reg_weight": 1.0, "reg_gradient": "ste"}))
     assert len(tools.trained) == 1
     for other in (
         TRIAL.clod(3.0),
@@ -134,6 +134,13 @@ def test_an_option_that_came_later_trains_anew_only_where_it_acts(tmp_path):
     before = training.settings(defaults)
     assert training.settings({**defaults, "least_level_gain": "0.0"}) == before
     assert training.settings({**defaults, "least_level_gain": "0.5"}) != before
+
+
+def test_what_only_shows_does_not_train_anew(tmp_path):
+    _, tools = fake_lab(tmp_path)
+    defaults, training = dict(tools.defaults("clodsplat")), TRIAL.clod()
+    found = [training.settings({**defaults, "detail_scales": scales}) for scales in ("(1.0,)", "(1.0, 2.0)")]
+    assert found[0] == found[1]
 
 
 def test_a_default_that_changed_trains_anew(tmp_path):
@@ -201,7 +208,7 @@ def blank_pictures(monkeypatch):
 
 
 def options_in(tmp_path, **more):
-    return ClodOptions(tmp_path / "out", **{"steps": 30, "frames": 4, "s_max": (1.0, 5.0), **more})
+    return ClodOptions(tmp_path / "out", **{"steps": 30, "frames": 4, "s_max": (1.0, DEFAULT_SCALE), **more})
 
 
 def run(options, **more):
@@ -213,8 +220,8 @@ def run(options, **more):
 def test_everything_is_measured_once_and_written(tmp_path):
     options = options_in(tmp_path, docs=tmp_path / "docs" / "clodsplat.md")
     shown, tools, text = run(options)
-    # s_max 1 and 5, plain, its coarse sibling, 7 more cells of the ablation and one without decay
-    assert len(tools.trained) == 2 + 2 + 7 + 1
+    # s_max 1 and the default, plain, its coarse sibling, 8 cells of the ablation (s_max 5) and one without decay
+    assert len(tools.trained) == 2 + 2 + 8 + 1
     assert [each.part.name for each in shown] == ["curve", "budget", "pops", "ablation", "sigma"]
     out = options.output_dir
     report = json.loads((out / "clod.json").read_text())
@@ -252,7 +259,7 @@ def test_sections_that_are_finished_stay_on_the_page(tmp_path):
     run(options_in(tmp_path, only=("sigma",)))
     shown, tools, _ = run(options_in(tmp_path, only=("budget",)))
     assert [each.part.name for each in shown] == ["budget", "sigma"]
-    assert [training.method for training in tools.trained] == ["lapsplat"], "s_max 5 is trained already"
+    assert [training.method for training in tools.trained] == ["lapsplat"], "the default is trained already"
     other, _, _ = run(options_in(tmp_path, only=("sigma",), steps=31))
     assert [each.part.name for each in other] == ["sigma"], "other settings, another page"
 

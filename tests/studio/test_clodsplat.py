@@ -111,7 +111,7 @@ class TestSteps:
         held = {step for reset in resets for step in range(reset + 1, reset + 1 + model.schedule.reset_pause)}
         assert all(scales[step] == 1 for step in held & scales.keys())
         free = [scale for step, scale in scales.items() if not model.schedule.recovers(step)]
-        assert len(free) > 10 and min(free) > 1 and max(free) <= 5
+        assert len(free) > 10 and min(free) > 1 and max(free) <= model.config.largest_scale
 
     def test_every_row_stays_and_the_hidden_are_not_seen(self, make):
         trainer = make(full_detail_every=0)
@@ -153,7 +153,7 @@ class TestSteps:
                 state[key].zero_()
             _, losses, metrics = advance(trainer, 1)
             found[weigh] = (float(losses["image_1"].detach()), state["grad2d"].clone(), metrics["scale"])
-        w = (1 - 0.5 * found[True][2] / 5) ** 2
+        w = (1 - 0.5 * found[True][2] / trainer.pipeline.model.config.largest_scale) ** 2
         assert found[True][0] == pytest.approx(w * found[False][0], rel=1e-4) and w < 0.82
         torch.testing.assert_close(found[True][1], found[False][1], rtol=1e-3, atol=1e-9)
 

@@ -134,12 +134,12 @@ def test_decays_scales_and_a_page(faded, spoilt, tmp_path, trim):
     text = trim("--load-config", run, "--output-dir", out, "--max-loss-db", 0.3, "--docs", page)
     assert str(out / "config.yml") in text and "held-out views, by which nothing was chosen" in text
     old, new = load_run(run), load_run(out / "config.yml")
-    for scale in (1.0, 1.5, 2.0, 3.0, 5.0):
+    for scale in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0):
         pair = [mean_psnr(run, "train", attenuation=run.model.attenuation(scale)) for run in (old, new)]
         assert pair[1] >= pair[0] - 0.3, scale
     written = page.read_text()
     assert written.startswith("# T\n") and written.endswith("end\n") and "| as trained |" in written
-    assert "decay: kept: up to s_v = 5" in written
+    assert "decay: kept: up to s_v = 7" in written
 
 
 def test_a_decay_that_never_cuts_goes(faded, spoilt, trim):

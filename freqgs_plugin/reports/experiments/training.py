@@ -16,6 +16,8 @@ ABLATION_SCALE = 5.0
 """s_max of the ablation (the paper's: 5)"""
 _LATER = {"auto_psnr": "30.0", "auto_share": "0.1", "least_level_gain": "0.0", "base_share": "1.0"}
 """options that a model has got since runs were kept, with the values at which they change nothing"""
+_ONLY_SHOWN = {"detail_scales": "(1.0, 1.5, 2.0, 3.0, 5.0)"}
+"""options that training does not read, with the value that stands for all"""
 _DOWNSCALED = re.compile(r"images_\d+$")
 
 
@@ -57,7 +59,7 @@ class Training:
         assert not unknown, f"{self.method} has no options {sorted(unknown)}"
         model = {**defaults, **{name: repr(value) for name, value in self.options.items()}, "seed": repr(self.seed)}
         # so that what was trained before they were there is found again
-        model = {name: value for name, value in model.items() if _LATER.get(name) != value}
+        model = {name: _ONLY_SHOWN.get(name, value) for name, value in model.items() if _LATER.get(name) != value}
         return {"scene": self.scene.identity, "method": self.method, "steps": self.steps, "model": model}
 
 

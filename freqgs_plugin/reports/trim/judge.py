@@ -91,10 +91,11 @@ class Judge:
 
 
 def scales_of(run: Any) -> list[float]:
-    """The distance scales that a run is evaluated at, rising from 1; none where it does not decay."""
+    """The distance scales that a run is evaluated at and the largest in training, rising from 1; none without decay."""
     if run.gaussians.decay is None:
         return []
-    return sorted({1.0, *(float(scale) for scale in run.model.config.detail_scales if scale >= 1)})
+    config = run.model.config
+    return sorted({1.0, float(config.largest_scale), *(float(scale) for scale in config.detail_scales if scale >= 1)})
 
 
 def attenuation_at(run: Any, gaussians: Gaussians, scale: float) -> Attenuation | None:
