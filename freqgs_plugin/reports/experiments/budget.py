@@ -143,7 +143,7 @@ def tables(scene: str, results: Results) -> list[BenchTable]:
             ("PSNR, dB", lambda row: shown(row["seeds"], lambda s: s["psnr"])),
             ("SSIM", lambda row: shown(row["seeds"], lambda s: s["ssim"], ".4f")),
             ("Gaussians", lambda row: shown(row["seeds"], lambda s: s["gaussians"], ",.0f")),
-            ("of plain", lambda row: f"{mean(row['seeds'], lambda s: s['gaussians']) / plain:.2f}"),
+            ("of plain", lambda row: f"{mean(row['seeds'], lambda s: s['gaussians']) / plain:.3f}"),
         ],
     )
     return [by_share, at_full]
@@ -172,7 +172,7 @@ def full_detail_goal(scene: str, results: Results) -> Goal:
     return Goal(
         scene,
         f"full detail: at most {LOSS:g} dB under plain with at most {FEWER:g} of its Gaussians",
-        f"{gain:+.2f} dB with {share:.2f}",
+        f"{gain:+.2f} dB with {share:.3f}",
         reached,
     )
 
