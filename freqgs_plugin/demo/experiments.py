@@ -43,7 +43,7 @@ def clod(options: ClodFlags = ClodOptions()) -> None:  # noqa: B008
 def claims(options: ClaimsFlags = ClaimsOptions()) -> None:  # noqa: B008
     """Put each claim of the two papers to the test, beside a plain model: holds or not, with its figures.
 
-    Trains 18 runs for each scene and seed, one at a time: hours on a CPU. Whatever is finished is kept, and the same
+    Trains 19 runs for each scene and seed, one at a time: hours on a CPU. Whatever is finished is kept, and the same
     command goes on from there.
     """
     from freqgs_plugin.reports.experiments.claims_runner import check_claims, run_claims

@@ -251,11 +251,12 @@ def _parts_matter(scene: str, results: Results) -> Verdict:
     def multi(name: str, figure: str) -> float:
         return mean(results, lambda r: next(row for row in r["curve"][name] if row["scale"] == ABLATION_SCALE)[figure])
 
-    lost = multi("1", "psnr") - multi("5", "psnr")
-    more = multi("1", "drawn") / multi("5", "drawn") - 1
+    trained = f"{ABLATION_SCALE:g}"
+    lost = multi("1", "psnr") - multi(trained, "psnr")
+    more = multi("1", "drawn") / multi(trained, "drawn") - 1
     words.append(f"without other scales {lost:+.2f} dB with {100 * more:+.0f} %")
     matter.append(lost < -EQUAL or more > 0.05)
-    return Verdict(f"{', '.join(words)}; with ours", all(matter))
+    return Verdict(f"{', '.join(words)}; with ours and s_max {trained}", all(matter))
 
 
 def _parts(lab: Lab, trial: Trial, options: TrialOptions) -> dict[str, Any]:
