@@ -130,10 +130,17 @@ def tables(scene: str, results: Results) -> list[BenchTable]:
         "Gaussians and s_v (of *clodsplat*) are means over views. *Margin*: above the best of the first three plain "
         "columns.",
     )
+    plain = [result["full"]["plain"]["gaussians"] for result in results]
     full: list[Row] = [
-        {"model": name, "seeds": [result["full"][name] for result in results]} for name in ("plain", "clod")
+        {
+            "model": name,
+            "seeds": [
+                {**result["full"][name], "share": result["full"][name]["gaussians"] / all_of_plain}
+                for result, all_of_plain in zip(results, plain, strict=True)
+            ],
+        }
+        for name in ("plain", "clod")
     ]
-    plain = mean(full[0]["seeds"], lambda s: s["gaussians"])
     at_full = BenchTable(
         f"clod-full-{scene}",
         f"{scene}: full detail",
@@ -143,7 +150,7 @@ def tables(scene: str, results: Results) -> list[BenchTable]:
             ("PSNR, dB", lambda row: shown(row["seeds"], lambda s: s["psnr"])),
             ("SSIM", lambda row: shown(row["seeds"], lambda s: s["ssim"], ".4f")),
             ("Gaussians", lambda row: shown(row["seeds"], lambda s: s["gaussians"], ",.0f")),
-            ("of plain", lambda row: f"{mean(row['seeds'], lambda s: s['gaussians']) / plain:.3f}"),
+            ("of plain", lambda row: shown(row["seeds"], lambda s: s["share"], ".3f")),
         ],
     )
     return [by_share, at_full]
