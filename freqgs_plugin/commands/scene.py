@@ -12,10 +12,9 @@ from freqgs_plugin.io.parameters import RawGaussians
 from freqgs_plugin.io.ply import read_ply
 from freqgs_plugin.rendering.base import Rasterizer, get_rasterizer
 from freqgs_plugin.reports.bench.trained import load, views_of_split
+from freqgs_plugin.training.presets import LARGEST_SCALE
 from freqgs_plugin.types import Camera, Gaussians
 
-LARGEST_SCALE = 5.0
-"""`largest-scale` of clodsplat, if not told otherwise"""
 MOST_PIXELS = 1 << 28
 """of a picture: 16384 x 16384, for which about 10 GB of memory are taken"""
 

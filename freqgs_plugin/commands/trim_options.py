@@ -12,7 +12,7 @@ class TrimOptions:
     """config.yml of a finished lapsplat or clodsplat run; nothing in its folder is changed"""
     max_loss_db: float = 0.05
     """PSNR that may be lost on the training views, dB: by the whole scene, by every prefix of levels, and at every
-    distance scale that the run is evaluated at"""
+    distance scale that the run is evaluated at, the largest in training among them"""
     output_dir: Path | None = None
     """folder of the new run, EXPERIMENT/METHOD/NAME; without it a folder beside the old one, its name with -trimmed"""
     dry_run: bool = False

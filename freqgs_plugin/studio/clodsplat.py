@@ -28,6 +28,7 @@ from freqgs_plugin.studio.targets import ViewTarget
 from freqgs_plugin.studio.viewing import psnr, show, uncached_property
 from freqgs_plugin.training.detail import CountGradient, DetailSampling, count_loss
 from freqgs_plugin.training.objective import pyramid_objective
+from freqgs_plugin.training.presets import LARGEST_SCALE
 from freqgs_plugin.training.schedule import Schedule, scaled
 from freqgs_plugin.types import Camera, Gaussians, Rendering
 
@@ -46,7 +47,7 @@ class ClodSplatModelConfig(FreqSplatModelConfig):
     """step from which opacities decay with distance (the paper)"""
     initial_decay: float = 5.0
     """sigma of every Gaussian at first, in normalised distances (ours; the paper does not say)"""
-    largest_scale: float = 7.0
+    largest_scale: float = LARGEST_SCALE
     """s_max: training draws its virtual distance scale from U(1, s_max) (the paper: 1, 3, 5 or 7)"""
     full_detail_every: int = 2
     """every so many steps the scale is 1 (ours); 0: only by chance (the paper)"""

@@ -64,7 +64,7 @@ def count_loss(
 ) -> Float[Tensor, ""]:
     """(s_v - 1)^2 max(share drawn - target share, 0)^2, over all Gaussians (Eq. 4); 0 without Gaussians.
 
-    With a gradient, the first factor is ((s_v - 1) / (s_max - 1))^2: unnormalised it reaches 16 at s_max = 5, hundreds
+    With a gradient, the first factor is ((s_v - 1) / (s_max - 1))^2: unnormalised it reaches 36 at s_max = 7, hundreds
     of times the image loss.
 
     Args:

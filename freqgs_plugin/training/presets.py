@@ -10,6 +10,9 @@ from freqgs_plugin.training.schedule import REFERENCE_STEPS
 
 Value = bool | int | float | str
 
+LARGEST_SCALE = 7.0
+"""s_max of clodsplat if not told otherwise: the largest of the paper's, and what measured best"""
+
 PLAIN: Mapping[str, Any] = {
     "num_levels": 1,
     "densify_grad_thresh": 0.0008,

@@ -14,13 +14,14 @@ from running import SIZE, command
 from freqgs_plugin.apps.foveation import Foveation
 from freqgs_plugin.apps.rescaled import render_rescaled
 from freqgs_plugin.cli import main
-from freqgs_plugin.commands.scene import resized
+from freqgs_plugin.commands.scene import open_scene, resized
 from freqgs_plugin.functional.budget import DecayBudget
 from freqgs_plugin.io.images import read_image, to_uint8, write_image
 from freqgs_plugin.io.parameters import GROUPS, RawGaussians
 from freqgs_plugin.io.ply import write_ply
 from freqgs_plugin.reports.contact_sheet import GAP, LABEL
 from freqgs_plugin.studio.checkpoint import load_run
+from freqgs_plugin.studio.clodsplat import ClodSplatModelConfig
 
 pytestmark = pytest.mark.slow
 
@@ -160,6 +161,12 @@ def test_a_budget_holds_the_scale_that_decays_were_trained_for(faded, tmp_path, 
         )
     shown = read_image(tmp_path / "few" / f"{Path(view.name).stem}.png").astype(int)
     assert np.abs(shown - expected).max() <= 1 < np.abs(shown - free).max()
+
+
+def test_of_a_file_alone_the_default_is_the_largest_scale(faded):
+    scene = open_scene(faded, None, "numba")
+    assert scene.largest_scale == scene.run.largest_scale
+    assert replace(scene, run=None).largest_scale == ClodSplatModelConfig().largest_scale
 
 
 def test_a_ply_along_a_path(trained, tmp_path, render):

@@ -29,8 +29,8 @@ INTRODUCTION = f"""\
 Neighbouring frames, compared: the mean absolute difference over pixels and colours, in grey levels of 255. *Sudden* is
 the largest excess of a change over the median of the eleven around it, *worst pixel* the largest change of any pixel.
 One clodsplat model (s_max {DEFAULT_SCALE:g}), with the soft and the hard cut and the three distance references, beside
-two discrete models that are switched halfway: a plain model, and a second one whose densification was stopped at as
-many Gaussians as clodsplat draws at s_v = {DEFAULT_SCALE:g}.
+two discrete models that are switched halfway: a plain model, and a second one that grew no further once it had as
+many Gaussians as clodsplat draws at s_v = {DEFAULT_SCALE:g} (its last growth may go beyond them).
 
 * *sweep*: s_v rises from 1 to {DEFAULT_SCALE:g} in equal steps, seen from the middle held-out view.
 * *dolly*: the camera goes away in a straight line, distance growing more than tenfold by equal factors, at s_v =

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from freqgs_plugin.training.presets import PLAIN, Value
+from freqgs_plugin.training.presets import LARGEST_SCALE, PLAIN, Value
 from freqgs_plugin.types import Camera
 
-DEFAULT_SCALE = 7.0
+DEFAULT_SCALE = LARGEST_SCALE
 """s_max of clodsplat's default, of all runs but those of the sections curve, sigma and ablation"""
 ABLATION_SCALE = 5.0
 """s_max of the ablation (the paper's: 5)"""

@@ -18,7 +18,7 @@ Quality = dict[str, float]
 
 
 class Judge:
-    """Draws a run's views as the run does: every prefix of levels, or every distance scale that it is evaluated at.
+    """Draws a run's views as the run does: every prefix of levels, or every distance scale in `scales_of`.
 
     The last entry of a `Quality` is the whole scene.
     """
