@@ -240,22 +240,23 @@ def use_focus(page, counts):
 
 
 def test_detail_scale_in_a_browser(faded, chromium, tmp_path):
+    farthest = 14  # twice s_max
     with Viewer(faded, tmp_path / "viewer.log") as viewer:
-        page = Page(chromium, viewer.port, "Detail scale", 10)
+        page = Page(chromium, viewer.port, "Detail scale", farthest)
         most, everything, _ = wait_until(page.drawn, "a picture")
         page.settled(most)
         assert 0 < most <= everything
         full = page.picture(tmp_path / "full.png")
         assert full.std() > 5, "the page shows no picture"
 
-        assert page.slide(1.0) == 10.0
+        assert page.slide(1.0) == farthest
         least = wait_until(lambda: page.drawn() and page.drawn()[0] < most and page.drawn(), "fewer Gaussians")[0]
         page.settled(least)
         change = difference(full, page.picture(tmp_path / "far.png"))
         assert change > 0.5
 
         between = page.slide(0.6)
-        assert 1.0 < between < 10.0
+        assert 1.0 < between < farthest
         wait_until(lambda: page.drawn() and least < page.drawn()[0] <= most, "a scale in between")
 
         assert page.slide(0.0) == 1.0
@@ -263,7 +264,7 @@ def test_detail_scale_in_a_browser(faded, chromium, tmp_path):
         assert difference(full, page.picture(tmp_path / "again.png")) < change / 2
 
         names = page.choose_output("decay")
-        expected = {"rgb", "depth", "decay", "drawn_share", *(f"detail_{s}" for s in ("1", "1.5", "2", "3", "5"))}
+        expected = {"rgb", "depth", "decay", "drawn_share", *(f"detail_{s}" for s in ("1", "1.5", "2", "3", "5", "7"))}
         assert expected <= set(names)
         wait_until(lambda: difference(full, page.look()) > change / 2, "decays as colours")
         page.page.close()
