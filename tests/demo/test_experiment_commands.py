@@ -10,7 +10,7 @@ from freqgs_plugin.demo import experiments, training
 from freqgs_plugin.reports.experiments import ablation
 from freqgs_plugin.reports.experiments.options import ClodOptions, ExperimentError
 from freqgs_plugin.reports.experiments.store import alone
-from freqgs_plugin.reports.experiments.training import ExperimentScene, Trial
+from freqgs_plugin.reports.experiments.training import ABLATION_SCALE, DEFAULT_SCALE, ExperimentScene, Training, Trial
 from freqgs_plugin.training.presets import CLODSPLAT_PAPER, LAPSPLAT_PAPER, PLAIN
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -23,9 +23,10 @@ def test_defaults_have_every_option_that_is_set():
     for one in ablation.trainings(trial).values():
         assert set(one.options) <= set(clod)
         one.settings(clod)
-    # w_s and L_reg as in the method, so that the ablation's row is the method's own run
+    # w_s and L_reg as in the method, so that the ablation's row is a run of the curves
     default = ablation.trainings(trial)[ablation.name_of(True, "ste")]
-    assert default.settings(clod) == trial.clod().settings(clod)
+    assert default.settings(clod) == trial.clod(ABLATION_SCALE).settings(clod)
+    assert trial.clod(DEFAULT_SCALE).settings(clod) == Training(trial.scene, "clodsplat", 30, 42).settings(clod)
 
 
 @pytest.mark.parametrize(

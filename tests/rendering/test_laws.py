@@ -144,7 +144,7 @@ def test_crops_of_a_camera_are_crops_of_its_picture(draw, assert_close, seed, x,
     splats = scenes.replace(splats, opacities=splats.opacities.clamp_max(0.3))
     camera = scenes.camera(96, 80, focal=60.0)
     whole = draw(splats, camera)[0]
-    assert whole.alpha.max() > 0.05
+    assert whole.alpha.max() > 0.02, "something shows (of 4,000 seeds the faintest: 0.042)"
     for left, right in ((0, x), (x, 96)):
         for top, bottom in ((0, y), (y, 80)):
             K = camera.K.clone()

@@ -404,7 +404,7 @@ class TestPictures:
         camera, batch = view(trainer)
         model = trainer.pipeline.model
         outputs = model.get_outputs_for_camera(camera)
-        details = [f"detail_{s}" for s in ("1", "1.5", "2", "3", "5")]
+        details = [f"detail_{s}" for s in ("1", "1.5", "2", "3", "5", "7")]
         assert list(outputs) == ["rgb", "depth", "accumulation", "background", *details, "drawn_share", "decay"]
         for name, value in outputs.items():
             assert value.shape == (SIZE[1], SIZE[0], 1 if name in ("depth", "accumulation", "drawn_share") else 3), name
