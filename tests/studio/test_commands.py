@@ -352,7 +352,7 @@ def test_config_is_readable(trained):
     assert config.method_name == "lapsplat" and config.pipeline.model.num_levels == 3
 
 
-DETAILS = ("1", "1.5", "2", "3", "5")
+DETAILS = ("1", "1.5", "2", "3", "5", "7")
 
 
 class TestClodsplat:
